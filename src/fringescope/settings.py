@@ -1,0 +1,147 @@
+"""Every threshold in one typed tree: frozen, with unit, default and paper section; YAML in and out; stored with every scan.
+
+Each field is declared with `knob(default, unit, doc, paper)`; `describe()` lists them all and the docs are made of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+
+from fringescope.errors import UsageError
+
+
+def knob(default: Any, unit: str, doc: str, paper: str = "", low: float | None = None, high: float | None = None) -> Any:
+    """A settings field: its default, unit ("" = dimensionless), meaning, paper section and allowed closed range."""
+    return field(default=default, metadata={"unit": unit, "doc": doc, "paper": paper, "low": low, "high": high})
+
+
+class _Section:
+    """Checks ranges and types of a section's fields when it is made."""
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):  # type: ignore[arg-type]
+            value, meta = getattr(self, f.name), f.metadata
+            if "unit" not in meta:
+                continue
+            if isinstance(f.default, bool) != isinstance(value, bool) or (
+                not isinstance(f.default, (bool, str)) and not isinstance(value, (int, float))
+            ) or (isinstance(f.default, str) and not isinstance(value, str)):
+                raise UsageError(f"setting {f.name}: {value!r}; needed a {type(f.default).__name__}")
+            if isinstance(value, (int, float)) and not isinstance(value, bool):
+                low, high = meta["low"], meta["high"]
+                if value != value or (low is not None and value < low) or (high is not None and value > high):
+                    lo, hi = "-inf" if low is None else low, "inf" if high is None else high
+                    raise UsageError(f"setting {f.name}: {value}; needed {lo} to {hi} {meta['unit']}".rstrip())
+
+
+@dataclass(frozen=True)
+class PhaseSettings(_Section):
+    """Frames to absolute phase (II-C)."""
+
+    order_min_margin: float = knob(3.0, "sigma", "an order is uncertain if the next one fits less than this many standard deviations worse", "II-C", 0)
+    order_max_residual: float = knob(6.0, "sigma", "an order is uncertain if the coarse phase misses the fine one by more than this", "II-C", 0)
+    order_votes: int = knob(5, "pixels", "side of the window in which neighbours vote on a pixel's order; 1 = no vote", "II-C", 1, 31)
+    order_majority: float = knob(0.7, "", "share of the votes that repairs an order", "II-C", 0.5, 1)
+    max_misfit: float = knob(6.0, "sigma", "N-step samples that miss the fitted sinusoid by more than this are inconsistent frames", "", 0)
+    max_saturated: int = knob(0, "samples", "saturated samples of the finest set that a pixel may have", "III-D", 0)
+
+
+@dataclass(frozen=True)
+class DenoiseSettings(_Section):
+    """The masks of section III-D and the fourth test. Thresholds in codes are given for 8 bits and scale with the depth."""
+
+    min_background: float = knob(3.0, "8-bit codes", "pixels darker than this are dark", "III-D 1", 0)
+    min_modulation: float = knob(3.0, "8-bit codes", "pixels modulated less than this have low modulation", "III-D 1", 0)
+
+
+@dataclass(frozen=True)
+class FuseSettings(_Section):
+    """Three grids to one coloured cloud (III-C end, Fig. 12)."""
+
+
+@dataclass(frozen=True)
+class MeshSettings(_Section):
+    """The cloud to a textured mesh with levels of detail."""
+
+
+@dataclass(frozen=True)
+class PatternSettings(_Section):
+    """Fringe direction and periods (III-C, Table I, V-B)."""
+
+
+@dataclass(frozen=True)
+class Settings(_Section):
+    """The whole tree, as stored in every scan."""
+
+    phase: PhaseSettings = field(default_factory=PhaseSettings)
+    denoise: DenoiseSettings = field(default_factory=DenoiseSettings)
+    fuse: FuseSettings = field(default_factory=FuseSettings)
+    mesh: MeshSettings = field(default_factory=MeshSettings)
+    patterns: PatternSettings = field(default_factory=PatternSettings)
+
+
+def to_dict(s: Settings) -> dict[str, Any]:
+    """Plain dictionaries and numbers, for JSON or YAML."""
+    return dataclasses.asdict(s)
+
+
+def from_dict(d: Mapping[str, Any], base: Settings | None = None) -> Settings:
+    """Settings from nested dictionaries; what is not named keeps the value of `base` (default: the defaults).
+
+    Raises UsageError for an unknown section or name, a wrong type or a value out of range.
+    """
+    base = base or Settings()
+    sections = typing.get_type_hints(Settings)
+    changed: dict[str, Any] = {}
+    for name, part in d.items():
+        if name not in sections:
+            raise UsageError(f"settings: unknown section '{name}'; there are {', '.join(sections)}")
+        if not isinstance(part, Mapping):
+            raise UsageError(f"settings: section '{name}' is {part!r}; needed names with values")
+        known = {f.name for f in dataclasses.fields(sections[name])}
+        for key in part:
+            if key not in known:
+                raise UsageError(f"settings: '{name}' has no '{key}'; it has {', '.join(sorted(known))}")
+        changed[name] = dataclasses.replace(getattr(base, name), **part)
+    return dataclasses.replace(base, **changed)
+
+
+def to_yaml(s: Settings) -> str:
+    """The tree as YAML, every field with its unit and meaning as a comment."""
+    lines: list[str] = []
+    for section, f, value in describe(s):
+        if not lines or section != lines_section:
+            lines.append(f"{section}:")
+            lines_section = section
+        shown = yaml.safe_dump(value, default_flow_style=True).replace("\n...", "").strip()
+        unit = f" {f.metadata['unit']};" if f.metadata["unit"] else ""
+        lines.append(f"  {f.name}: {shown}  #{unit} {f.metadata['doc']}")
+    return "\n".join(lines) + "\n"
+
+
+def from_yaml(text: str, base: Settings | None = None) -> Settings:
+    """Settings from YAML text. Raises UsageError as `from_dict`, and for text that is not YAML."""
+    try:
+        d = yaml.safe_load(text)
+    except yaml.YAMLError as e:
+        raise UsageError(f"settings: not YAML: {str(e).splitlines()[0]}") from e
+    if d is None:
+        d = {}
+    if not isinstance(d, Mapping):
+        raise UsageError("settings: needed sections with names and values")
+    return from_dict(d, base)
+
+
+def describe(s: Settings | None = None) -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    """Every knob: (section name, field with its metadata, value)."""
+    s = s or Settings()
+    for sec in dataclasses.fields(s):
+        part = getattr(s, sec.name)
+        for f in dataclasses.fields(part):
+            yield sec.name, f, getattr(part, f.name)
