@@ -115,10 +115,11 @@ def from_dict(d: Mapping[str, Any], base: Settings | None = None) -> Settings:
 def to_yaml(s: Settings) -> str:
     """The tree as YAML, every field with its unit and meaning as a comment."""
     lines: list[str] = []
+    current = ""
     for section, f, value in describe(s):
-        if not lines or section != lines_section:
+        if section != current:
             lines.append(f"{section}:")
-            lines_section = section
+            current = section
         shown = yaml.safe_dump(value, default_flow_style=True).replace("\n...", "").strip()
         unit = f" {f.metadata['unit']};" if f.metadata["unit"] else ""
         lines.append(f"  {f.name}: {shown}  #{unit} {f.metadata['doc']}")
