@@ -96,12 +96,12 @@ def inside_volume(volume: Volume, p_world: ArrayLike) -> Bool:
 
 
 def working_point(rig: Rig) -> F64:
-    """The point (3,) where the devices look: nearest to the principal rays of the projector and all cameras, in world mm.
+    """The point (3,), world mm, where the devices look: nearest to the middle rays of the projector and all cameras.
 
-    With one camera too. Raises RigError if all axes are parallel.
+    Raises RigError if all axes are parallel.
     """
     A, b = np.zeros((3, 3)), np.zeros(3)
-    for d in (rig.projector, *rig.cameras):
+    for d in rig.devices:
         mid = [(d.lens.width - 1) / 2, (d.lens.height - 1) / 2]
         o, n = world_rays(d, mid)
         M = np.eye(3) - np.outer(n, n)
@@ -109,14 +109,13 @@ def working_point(rig: Rig) -> F64:
         b += M @ o
     if np.linalg.cond(A) > 1e8:
         raise RigError("the axes of projector and cameras are parallel; add a measuring \"volume\" to the rig")
-    p: F64 = np.linalg.solve(A, b)
-    return p
+    return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
 
 
 def field_of_view(rig: Rig, p_world: ArrayLike) -> Bool:
     """Whether world points (..., 3) are seen by the projector and all cameras of the rig."""
     ok = np.ones(np.asarray(p_world).shape[:-1], dtype=bool)
-    for d in (rig.projector, *rig.cameras):
+    for d in rig.devices:
         uv = project(d, p_world)
         with np.errstate(invalid="ignore"):
             ok &= (uv >= -0.5).all(-1) & (uv[..., 0] <= d.lens.width - 0.5) & (uv[..., 1] <= d.lens.height - 0.5)

@@ -235,6 +235,11 @@ class Rig:
         if len(set(names)) != len(names):
             raise RigError(f"camera names {names}: not unique")
 
+    @property
+    def devices(self) -> tuple[Camera | Projector, ...]:
+        """The projector, then the cameras."""
+        return (self.projector, *self.cameras)
+
     def index(self, name: str) -> int:
         """0-based index of the camera `name`. Raises RigError if the rig lacks it."""
         for i, c in enumerate(self.cameras):
@@ -319,7 +324,7 @@ class FrameKey(NamedTuple):
 
     set_index: int
     role: Role
-    index: int
+    number: int
 
 
 @dataclass(frozen=True)

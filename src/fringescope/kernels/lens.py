@@ -15,7 +15,9 @@ def distort(x, y, lens):
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return xd, yd
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -42,7 +44,7 @@ def to_plane(x, y, lens):
 
 @njit(cache=True, inline="always", error_model="numpy")
 def from_plane(u, v, lens):
-    """Plane coordinates to ideal normalised ones: Newton on `distort` until 1e-13, at most 20 steps; NaN if it fails."""
+    """Plane coordinates to ideal normalised ones: Newton on `distort` to 1e-13; NaN if it fails."""
     yd = (v - lens[3]) / lens[1]
     xd = (u - lens[2] - lens[4] * yd) / lens[0]
     x, y = xd, yd
