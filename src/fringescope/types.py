@@ -7,7 +7,7 @@ radians; projector-plane units for fringe periods. `T_ab` maps b to a. See `docs
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntFlag
 from types import MappingProxyType
@@ -373,6 +373,20 @@ class NoiseModel:
     a: float
     b: float
     source: str = "default"  #: "residuals", "capture.json" or "default"
+
+
+@dataclass(frozen=True, eq=False)
+class ViewInput:
+    """What the pipeline takes of one view: its plan, its frames one by one in any order, its ring-light picture.
+
+    A frame is (H, W) uint8 or uint16 (RGB8: (H, W, 3)), raw as the sensor gave it. `color` is raw in
+    the same format, or None.
+    """
+
+    plan: ViewPlan
+    frames: Iterable[tuple[FrameKey, AnyArray]]
+    color: AnyArray | None = None
+    noise: NoiseModel | None = None
 
 
 # ------------------------------------------------------------------------------------------------- between the stages
