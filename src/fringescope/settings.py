@@ -74,6 +74,20 @@ class MeshSettings(_Section):
 class PatternSettings(_Section):
     """Fringe direction and periods (III-C, Table I, V-B)."""
 
+    finest_period: float = knob(36.0, "projector-plane units along v", "period of the finest set", "IV-A", 4)
+    finest_steps: int = knob(8, "frames", "steps of the finest set", "Table I", 3, 64)
+    coarse_steps: int = knob(4, "frames", "steps of every other set", "Table I", 3, 64)
+    wrap_margin: float = knob(1.05, "", "coarsest period over what the projector's plane spans along the fringe gradient; below 1 it wraps", "V-B", 1)
+    max_sets: int = knob(6, "sets", "sets that the planner may use for one direction", "", 1, 16)
+    max_order_error: float = knob(1e-6, "", "probability of a wrong order that the planner accepts at the design signal", "", 0, 1)
+    design_background: float = knob(20.0, "8-bit codes", "background of the darkest tissue that must still be measured", "", 0)
+    design_modulation: float = knob(8.0, "8-bit codes", "modulation of the darkest tissue that must still be measured", "", 0.1)
+    design_noise_a: float = knob(0.5, "8-bit codes^2", "noise variance of a dark sample, with the rounding to codes", "", 0)
+    design_noise_b: float = knob(0.02, "8-bit codes", "growth of the noise variance with intensity (shot noise)", "", 0)
+    response_error: float = knob(0.05, "rad", "greatest error of a coarse phase that is not noise: response curve, light from elsewhere", "", 0, 3)
+    level_low: int = knob(8, "8-bit codes", "darkest level of the drawn fringes; above 0 so that the trough stays linear", "", 0, 254)
+    level_high: int = knob(247, "8-bit codes", "brightest level of the drawn fringes", "", 1, 255)
+
 
 @dataclass(frozen=True)
 class Settings(_Section):
