@@ -1,0 +1,327 @@
+"""capture.json and its frames: a folder to `ViewInput`s whose frames are read one at a time, and back."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from fringescope.errors import CaptureError, FormatError
+from fringescope.store import files
+from fringescope.store.images import Images, check_frame, check_header, split_page, write_png
+from fringescope.store.rig import explain, parse_layout
+from fringescope.types import (
+    AnyArray,
+    FrameKey,
+    FringeSet,
+    GraySet,
+    Layout,
+    NoiseModel,
+    PixelFormat,
+    Role,
+    ViewInput,
+    ViewPlan,
+    plane_size,
+)
+
+FORMAT, VERSION = "fringescope-capture", 1
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow", frozen=True, allow_inf_nan=False)
+
+
+class _Noise(_Model):
+    a: float = Field(ge=0)
+    b: float = Field(ge=0)
+
+
+class _Projector(_Model):
+    width: int = Field(ge=1, le=1_000_000)
+    height: int = Field(ge=1, le=1_000_000)
+    layout: str = "grid"
+
+
+class _Set(_Model):
+    frames: list[str] = Field(max_length=1000)
+    cycles_per_pixel: list[float] | None = None
+    steps: int | None = None
+    exposure_us: float | None = Field(default=None, gt=0)
+    gray: str | None = None
+    cell: float | None = None
+    inverse: list[str] | None = None
+    white: str | None = None
+    black: str | None = None
+
+
+class _View(_Model):
+    camera: str
+    pixel_format: str
+    sets: list[_Set] = Field(max_length=1000)
+    color: str | None = None
+    noise: _Noise | None = None
+
+
+class _Capture(_Model):
+    format: str
+    version: int
+    projector: _Projector
+    views: list[_View] = Field(min_length=1, max_length=254)
+    noise: _Noise | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureView:
+    """One camera of a capture: its plan, the files of `plan.keys` in that order, and what else its entry says."""
+
+    plan: ViewPlan
+    files: tuple[str, ...]  #: relative to the capture's folder; "file.tif#3" names a page
+    size: tuple[int, int]  #: (width, height) of every frame
+    color: str | None = None
+    noise: NoiseModel | None = None
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+        return self.plan.camera
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A capture on disk. Frames are read when asked for, one at a time."""
+
+    folder: Path
+    document: Path  #: its capture.json
+    projector_width: int  #: device pixels
+    projector_height: int
+    layout: Layout
+    views: tuple[CaptureView, ...]
+    extra: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))  #: keys that we do not use
+    images: Images = field(repr=False, kw_only=True)
+
+    def view(self, camera: str) -> CaptureView:
+        """The view of `camera`. Raises CaptureError if the capture lacks it."""
+        for v in self.views:
+            if v.camera == camera:
+                return v
+        raise CaptureError(f"{self.document}: no view of '{camera}'; it has {', '.join(v.camera for v in self.views)}")
+
+
+class Frames:
+    """The frames of one view, (key, array) in the order of `plan.keys`, read one at a time; may be iterated again."""
+
+    def __init__(self, capture: Capture, view: CaptureView) -> None:
+        self._capture, self._view = capture, view
+
+    def __len__(self) -> int:
+        return len(self._view.files)
+
+    def __iter__(self) -> Iterator[tuple[FrameKey, AnyArray]]:
+        images = Images(self._capture.folder)  # its own, so that views may be read in parallel
+        view = self._view
+        for key, name in zip(view.plan.keys, view.files, strict=True):
+            frame = images.frame(name, view.plan.pixel_format, view.size)
+            self._capture.images.digests.update(images.digests)
+            yield key, frame
+
+    def __getitem__(self, key: FrameKey) -> AnyArray:
+        view = self._view
+        return Images(self._capture.folder).frame(view.files[view.plan.keys.index(key)], view.plan.pixel_format, view.size)
+
+
+# ------------------------------------------------------------------------------------------------------------ reading
+
+
+def read_capture(path: Path | str) -> Capture:
+    """The capture in a folder, or of a `capture.json`.
+
+    Checks everything short of the samples: keys, versions, that each frame's file is there, and that its size, bits
+    and channels fit the view. File names must stay inside the folder. Raises FormatError for the document, CaptureError
+    for plans and frames.
+    """
+    path = Path(path)
+    document = path / files.CAPTURE if path.is_dir() else path
+    doc = files.read_json(document, "a capture (a folder with capture.json)")
+    files.check_format(doc, document, FORMAT, VERSION)
+    try:
+        m = _Capture.model_validate(doc)
+    except ValidationError as e:
+        raise FormatError(explain(e, document)) from None
+    p = m.projector
+    layout = parse_layout(p.layout, document)
+    images = Images(document.parent)
+    size = plane_size(p.width, p.height, layout)
+    views = tuple(_view(v, i, m.noise, size, document, images) for i, v in enumerate(m.views))
+    names = [v.camera for v in views]
+    if len(set(names)) != len(names):
+        raise CaptureError(f"{document}: cameras {', '.join(names)}: not unique; needed one view per camera")
+    extra = MappingProxyType(dict(m.model_extra or {}))
+    return Capture(document.parent, document, p.width, p.height, layout, views, extra, images=images)
+
+
+def _view(m: _View, i: int, noise: _Noise | None, size: tuple[int, int], document: Path, images: Images) -> CaptureView:
+    where = f"{document}: views[{i}]"
+    if bad := files.check_name(m.camera):
+        raise CaptureError(f"{where}.camera {files.shown(m.camera)}: {bad}")
+    try:
+        fmt = PixelFormat(m.pixel_format)
+    except ValueError:
+        known = ", ".join(f.value for f in PixelFormat)
+        raise CaptureError(f"{where}.pixel_format {files.shown(m.pixel_format)}; needed one of {known}") from None
+    sets: list[FringeSet | GraySet] = []
+    names: list[str] = []
+    for k, s in enumerate(m.sets):
+        try:
+            one, of_set = _set(s)
+        except CaptureError as e:
+            raise CaptureError(f"{where}.sets[{k}]: {e}") from None
+        if len(set(of_set)) != len(of_set):
+            twice = next(n for n in of_set if of_set.count(n) > 1)
+            raise CaptureError(f"{where}.sets[{k}]: frame {files.shown(twice)} is named twice")
+        sets.append(one)
+        names += of_set
+    try:
+        plan = ViewPlan(m.camera, fmt, tuple(sets), size)
+    except CaptureError as e:
+        raise CaptureError(f"{where}: {e}") from None
+    every = names if m.color is None else [*names, m.color]
+    for n in every:
+        if bad := files.check_relative(n):
+            raise CaptureError(f"{where}: frame {files.shown(n)}: {bad}")
+    view_size: tuple[int, int] | None = None
+    for n in every:
+        head = images.header(n)
+        check_header(head, fmt, view_size, str(images.folder / n))
+        view_size = view_size or (head.width, head.height)
+    n_ = m.noise or noise
+    model = None if n_ is None else NoiseModel(n_.a, n_.b, files.CAPTURE)
+    assert view_size is not None  # a plan has at least one frame
+    return CaptureView(plan, tuple(names), view_size, m.color, model)
+
+
+def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
+    if (s.gray is None) == (s.cycles_per_pixel is None):
+        raise CaptureError("needed either \"cycles_per_pixel\" (fringes) or \"gray\" (Gray code)")
+    if s.gray is not None:
+        if s.cell is None:
+            raise CaptureError("a Gray code without \"cell\"; needed the width of one code value in projector-plane units")
+        if s.inverse is not None and len(s.inverse) != len(s.frames):
+            raise CaptureError(f"{len(s.inverse)} inverse frames for {len(s.frames)} frames; needed as many")
+        gray = GraySet(s.gray, s.cell, len(s.frames), s.inverse is not None, s.white is not None, s.black is not None)
+        pick: dict[Role, Callable[[int], str | None]] = {
+            Role.WHITE: lambda _: s.white, Role.BLACK: lambda _: s.black,
+            Role.BIT: lambda n: s.frames[n], Role.INVERSE: lambda n: (s.inverse or [])[n],
+        }
+        keys = ViewPlan("x", PixelFormat.MONO8, (gray,), (1, 1)).keys
+        return gray, [str(pick[k.role](k.number)) for k in keys]
+    steps = len(s.frames) if s.steps is None else s.steps
+    if s.steps is not None and s.steps != len(s.frames):
+        raise CaptureError(f"\"steps\" is {s.steps} but it names {len(s.frames)} frames; needed as many")
+    g = s.cycles_per_pixel
+    if g is None or len(g) != 2:
+        raise CaptureError(f"cycles_per_pixel {files.shown(g)}; needed two numbers")
+    if not 1e-9 < math.hypot(*g) < 1:
+        raise CaptureError(f"cycles_per_pixel {files.shown(g)}; needed a period of more than one projector-plane unit")
+    return FringeSet((g[0], g[1]), steps, s.exposure_us), list(s.frames)
+
+
+def view_inputs(capture: Capture) -> tuple[ViewInput, ...]:
+    """What the pipeline takes: per view its plan, its frames (read lazily, may be iterated again) and its picture.
+
+    The ring-light picture is read at once. Raises CaptureError here, or while frames are read, naming the file.
+    """
+    out = []
+    for v in capture.views:
+        color = None if v.color is None else capture.images.frame(v.color, v.plan.pixel_format, v.size)
+        out.append(ViewInput(v.plan, Frames(capture, v), color, v.noise))
+    return tuple(out)
+
+
+def hash_capture(capture: Capture) -> str:
+    """"sha256:..." over capture.json (as a JSON object) and the content of every file that it names.
+
+    Frames that were read already are not read again.
+    """
+    total = hashlib.sha256(files.canonical_hash(files.read_json(capture.document, "a capture")).encode())
+    names = {split_page(n)[0] for v in capture.views for n in (*v.files, *([v.color] if v.color else []))}
+    for name in sorted(names):
+        total.update(f"\n{name} {capture.images.digest(name)}".encode())
+    return "sha256:" + total.hexdigest()
+
+
+# ------------------------------------------------------------------------------------------------------------ writing
+
+
+def put_capture(
+    folder: Path, width: int, height: int, layout: Layout, views: Iterable[ViewInput], extra: Mapping[str, Any] | None = None
+) -> None:
+    """Writes a capture into an existing folder, frame by frame as `views` hand them out (any order within a view).
+
+    `width` x `height` are the projector's device pixels. Frames become `<camera>/NN.png`, NN their place in
+    `plan.keys`. Raises CaptureError where a frame is missing, doubled or does not fit its plan.
+    """
+    entries = [_put_view(folder, v) for v in views]
+    if not entries:
+        raise CaptureError("a capture without views; needed at least one")
+    projector = {"width": width, "height": height, "layout": layout.value}
+    doc = {"format": FORMAT, "version": VERSION, "projector": projector, "views": entries, **(extra or {})}
+    files.write_json(folder / files.CAPTURE, doc)
+
+
+def _put_view(folder: Path, view: ViewInput) -> dict[str, Any]:
+    plan = view.plan
+    if bad := files.check_name(plan.camera):
+        raise CaptureError(f"camera {files.shown(plan.camera)}: {bad}")
+    keys = plan.keys
+    digits = max(2, len(str(len(keys) - 1)))
+    names = {k: f"{plan.camera}/{i:0{digits}d}.png" for i, k in enumerate(keys)}
+    (folder / plan.camera).mkdir()
+    size: tuple[int, int] | None = None
+    seen: set[FrameKey] = set()
+    for key, frame in view.frames:
+        if key not in names:
+            raise CaptureError(f"view '{plan.camera}': a frame {key} that its plan lacks")
+        if key in seen:
+            raise CaptureError(f"view '{plan.camera}': frame {keys.index(key)} came twice")
+        checked = check_frame(frame, plan.pixel_format, size, names[key])
+        size = (checked.shape[1], checked.shape[0])
+        write_png(folder / names[key], checked)
+        seen.add(key)
+    if len(seen) < len(keys):
+        missing = [i for i, k in enumerate(keys) if k not in seen]
+        raise CaptureError(f"view '{plan.camera}': {len(seen)} frames came, the plan needs {len(keys)}; missing {missing[:8]}")
+    entry: dict[str, Any] = {"camera": plan.camera, "pixel_format": plan.pixel_format.value, "sets": []}
+    for i, s in enumerate(plan.sets):
+        of = {(k.role, k.number): names[k] for k in keys if k.set_index == i}
+        if isinstance(s, FringeSet):
+            one: dict[str, Any] = {"cycles_per_pixel": list(s.cycles_per_pixel), "steps": s.steps,
+                                   "frames": [of[Role.STEP, n] for n in range(s.steps)]}
+            if s.exposure_us is not None:
+                one["exposure_us"] = s.exposure_us
+        else:
+            one = {"gray": s.axis, "cell": s.cell, "frames": [of[Role.BIT, n] for n in range(s.bits)]}
+            if s.inverse:
+                one["inverse"] = [of[Role.INVERSE, n] for n in range(s.bits)]
+            one |= {r.value: of[r, 0] for r in (Role.WHITE, Role.BLACK) if (r, 0) in of}
+        entry["sets"].append(one)
+    if view.color is not None:
+        entry["color"] = f"{plan.camera}/color.png"
+        write_png(folder / entry["color"], check_frame(view.color, plan.pixel_format, size, entry["color"]))
+    if view.noise is not None:
+        entry["noise"] = {"a": view.noise.a, "b": view.noise.b}
+    return entry
+
+
+def write_capture(
+    folder: Path | str, width: int, height: int, layout: Layout, views: Iterable[ViewInput],
+    *, force: bool = False, extra: Mapping[str, Any] | None = None,
+) -> None:
+    """A new capture folder, whole or not at all: `new_folder` with `put_capture`. Raises OutputError, CaptureError."""
+    with files.new_folder(folder, marker=files.CAPTURE, force=force) as tmp:
+        put_capture(tmp, width, height, layout, views, extra)

@@ -1,0 +1,255 @@
+"""Outputs that appear whole or not at all: folders and files are written beside their place and renamed into it.
+
+A folder that we write holds a *marker*, the JSON file that says what it is (`capture.json`, `scan.json`, ...). `force`
+replaces a folder only if it holds the marker of what is being written: a scan never replaces a capture, nor a home folder.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from fringescope.errors import FormatError, OutputError
+
+CAPTURE, SCAN, DECODED = "capture.json", "scan.json", "decoded.json"
+
+_REASONS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota of the disk is used up",
+    errno.EFBIG: "the file would be larger than the system allows",
+    errno.EROFS: "the disk is read-only",
+    errno.EACCES: "no permission to write there",
+    errno.EPERM: "no permission to write there",
+    errno.ENAMETOOLONG: "the name is too long",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
+}
+
+
+def _why(e: OSError) -> str:
+    return _REASONS.get(e.errno or 0, (e.strerror or str(e) or type(e).__name__).splitlines()[0])
+
+
+def _sync(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _sync_folder(path: Path) -> None:
+    if os.name == "posix":  # a folder cannot be opened elsewhere
+        _sync(path)
+
+
+def _make_parents(parent: Path) -> list[Path]:
+    """Creates missing parents; returns those made, deepest first, so that a failure can take them away again."""
+    made: list[Path] = []
+    p = parent
+    while not p.exists():
+        made.append(p)
+        p = p.parent
+    parent.mkdir(parents=True, exist_ok=True)
+    return made
+
+
+def _umask_mode(mode: int) -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mode & ~mask
+
+
+def _check_target_folder(path: Path, marker: str, force: bool) -> None:
+    if not os.path.lexists(path):
+        return
+    if not path.is_dir():
+        raise OutputError(f"{path}: is a file; needed a new folder: choose another --out")
+    if not any(path.iterdir()):
+        return
+    if not (path / marker).is_file():
+        raise OutputError(f"{path}: holds other files (no {marker}); needed a new or empty folder: choose another --out")
+    if not force:
+        raise OutputError(f"{path}: already holds a {Path(marker).stem}; choose another --out, or add --force to replace it")
+
+
+@contextmanager
+def new_folder(path: Path | str, *, marker: str, force: bool = False) -> Iterator[Path]:
+    """A folder that appears whole at the end of the block, or not at all.
+
+    Yields a temporary sibling to write into. `marker` names the file that says what the folder holds; with `force` a folder that
+    holds that marker is replaced, and stays as it was until the new one is whole. Raises OutputError where `path` is
+    a file, holds other files, or holds the marker without `force`; and for any OSError in the block (disk full, no permission).
+    """
+    path = Path(path)
+    try:
+        _check_target_folder(path, marker, force)
+        target = path.resolve()  # a link to a folder stays a link
+        made = _make_parents(target.parent)
+    except OSError as e:
+        raise OutputError(f"{path}: cannot write: {_why(e)}") from e
+    work: Path | None = None
+    try:
+        try:
+            work = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".part", dir=target.parent))
+            yield work
+            for f in sorted(work.rglob("*")):
+                if f.is_file():
+                    _sync(f)
+            work.chmod(_umask_mode(0o777))
+            _sync_folder(work)
+            _check_target_folder(path, marker, force)  # somebody may have written there meanwhile
+            _swap(work, target)
+        except OSError as e:
+            raise OutputError(f"{path}: cannot write: {_why(e)}") from e
+    except BaseException:
+        if work is not None:
+            shutil.rmtree(work, ignore_errors=True)
+        for p in made:
+            with suppress(OSError):
+                p.rmdir()
+        raise
+
+
+def _swap(work: Path, target: Path) -> None:
+    old: Path | None = None
+    if target.exists():
+        old = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".old", dir=target.parent))
+        os.replace(target, old / "was")
+    try:
+        os.replace(work, target)
+    except BaseException:
+        if old is not None:
+            os.replace(old / "was", target)
+            old.rmdir()
+        raise
+    _sync_folder(target.parent)
+    if old is not None:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
+    """A file that appears whole at the end of the block, or not at all.
+
+    Yields a temporary sibling path with the same suffix, to be written. Raises OutputError where `path` exists (a
+    file is replaced with `force`, a folder never), and for any OSError in the block.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; needed the name of a file")
+    if os.path.lexists(path) and not force:
+        raise OutputError(f"{path}: exists; choose another name, or add --force to replace it")
+    try:
+        target = path.resolve()
+        made = _make_parents(target.parent)
+    except OSError as e:
+        raise OutputError(f"{path}: cannot write: {_why(e)}") from e
+    work: Path | None = None
+    try:
+        try:
+            fd, name = tempfile.mkstemp(prefix=f".{target.stem[:80]}.", suffix=f".part{target.suffix}", dir=target.parent)
+            os.close(fd)
+            work = Path(name)
+            yield work
+            work.chmod(_umask_mode(0o666))
+            _sync(work)
+            os.replace(work, target)
+            _sync_folder(target.parent)
+        except OSError as e:
+            raise OutputError(f"{path}: cannot write: {_why(e)}") from e
+    except BaseException:
+        if work is not None:
+            work.unlink(missing_ok=True)
+        for p in made:
+            with suppress(OSError):
+                p.rmdir()
+        raise
+
+
+# --------------------------------------------------------------------------------------------------------------- JSON
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """The JSON object in a file; `what` names it in errors ("a rig"). Raises FormatError, also where the file is missing."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise FormatError(f"{path}: not found; needed {what}") from None
+    except IsADirectoryError:
+        raise FormatError(f"{path}: is a folder; needed {what}") from None
+    except (OSError, ValueError) as e:
+        raise FormatError(f"{path}: cannot read {what}: {_why(e) if isinstance(e, OSError) else e}") from e
+    try:
+        out = json.loads(data.decode("utf-8-sig"))
+    except RecursionError:
+        raise FormatError(f"{path}: not {what}: nested too deeply") from None
+    except ValueError as e:
+        raise FormatError(f"{path}: not {what}: not JSON: {str(e).splitlines()[0][:120]}") from None
+    if not isinstance(out, dict):
+        raise FormatError(f"{path}: not {what}: needed a JSON object, came {type(out).__name__}")
+    return out
+
+
+def check_format(doc: Mapping[str, Any], path: Path, format_: str, version: int) -> None:
+    """Refuses another `format` and a higher `version`. Raises FormatError."""
+    if doc.get("format") != format_:
+        raise FormatError(f"{path}: \"format\" is {shown(doc.get('format'))}; needed \"{format_}\"")
+    v = doc.get("version")
+    if isinstance(v, bool) or not isinstance(v, int) or v < 1:
+        raise FormatError(f"{path}: \"version\" is {shown(v)}; needed a whole number from 1 to {version}")
+    if v > version:
+        raise FormatError(f"{path}: version {shown(v)} is newer than this program reads ({version}); update fringescope")
+
+
+def shown(value: object, length: int = 60) -> str:
+    """A value of somebody's file as one short line for an error."""
+    try:
+        text = json.dumps(value, ensure_ascii=True)
+    except (TypeError, ValueError, RecursionError):
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def write_json(path: Path, doc: Mapping[str, Any]) -> None:
+    """A JSON object as text, into a folder that is being made. Numbers must be finite."""
+    path.write_text(json.dumps(doc, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def canonical_hash(doc: Mapping[str, Any]) -> str:
+    """"sha256:..." of a JSON object, whatever its white space and the order of its keys."""
+    text = json.dumps(doc, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return "sha256:" + hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def check_name(name: str) -> str | None:
+    """What is wrong with a camera's name, which also names a folder; None if nothing is."""
+    if not name or len(name) > 100:
+        return "needed 1 to 100 characters"
+    if name in (".", "..") or name != name.strip() or name.endswith("."):
+        return "needed a name that a folder can have"
+    if any(c in '/\\:*?"<>|#' or ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name):
+        return "needed letters, digits, - and _ (it names a folder)"
+    return None
+
+
+def check_relative(name: str) -> str | None:
+    """What is wrong with a frame's file name in `capture.json`; None if it stays inside the capture's folder."""
+    if not name or len(name) > 1000:
+        return "needed a file name"
+    if any(ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name):
+        return "holds control characters"
+    if "\\" in name:
+        return "needed forward slashes"
+    if name.startswith(("/", "~")) or (len(name) > 1 and name[1] == ":"):
+        return "is absolute; needed a path inside the capture's folder"
+    if ".." in name.split("/"):
+        return "leaves the capture's folder; needed a path inside it"
+    return None

@@ -1,0 +1,155 @@
+"""rig.json: reading with every check, writing with nothing lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from fringescope.errors import FormatError, RigError
+from fringescope.store import files
+from fringescope.types import F64, Camera, Layout, Lens, Pose, Projector, Rig, Volume
+
+FORMAT, VERSION = "fringescope-rig", 1
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow", frozen=True)
+
+
+class _Device(_Model):
+    width: int = Field(ge=1, le=1_000_000)
+    height: int = Field(ge=1, le=1_000_000)
+    K: list[list[float]]
+    distortion: list[float]
+    R: list[list[float]]
+    t: list[float]
+
+
+class _Projector(_Device):
+    layout: str = "grid"
+
+
+class _Camera(_Device):
+    name: str
+
+
+class _Volume(_Model):
+    center: list[float]
+    axes: list[list[float]]
+    half_size: list[float]
+
+
+class _Rig(_Model):
+    format: str
+    version: int
+    units: str = "mm"
+    projector: _Projector
+    cameras: list[_Camera] = Field(max_length=254)
+    volume: _Volume | None = None
+
+
+def explain(e: ValidationError, path: Path) -> str:
+    """One line of what pydantic found."""
+    errors = e.errors(include_url=False, include_context=False)
+    first = errors[0]
+    where = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
+    got = "" if first["type"] == "missing" else f"; came {files.shown(first['input'])}"
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    return f"{path}: {files.shown(where)[1:-1]}: {first['msg']}{got}{more}"
+
+
+def parse_layout(name: str, path: Path) -> Layout:
+    """"grid" or "diamond". Raises FormatError."""
+    try:
+        return Layout(name)
+    except ValueError:
+        raise FormatError(f"{path}: projector.layout is {files.shown(name)}; needed \"grid\" or \"diamond\"") from None
+
+
+def read_rig(path: Path | str) -> Rig:
+    """The rig of a `rig.json`. Unknown keys are kept in `Rig.extra` (those of devices under "projector" and "cameras").
+
+    Raises FormatError where it is no rig or of a higher version, RigError where it cannot be a rig (NaN, singular K).
+    """
+    path = Path(path)
+    doc = files.read_json(path, "a rig")
+    files.check_format(doc, path, FORMAT, VERSION)
+    try:
+        m = _Rig.model_validate(doc)
+    except ValidationError as e:
+        raise FormatError(explain(e, path)) from None
+    if m.units != "mm":
+        raise RigError(f"{path}: units {files.shown(m.units)}; needed \"mm\"")
+    layout = parse_layout(m.projector.layout, path)
+    where = "projector"
+    try:
+        p = m.projector
+        w, h = (2 * p.width if layout is Layout.DIAMOND else p.width), p.height
+        projector = Projector(p.width, p.height, layout, Lens(w, h, _np(p.K), _np(p.distortion)), Pose(_np(p.R), _np(p.t)))
+        cameras = []
+        for i, c in enumerate(m.cameras):
+            where = f"cameras[{i}]"
+            if bad := files.check_name(c.name):
+                raise RigError(f"name {files.shown(c.name)}: {bad}")
+            where = f"camera '{c.name}'"
+            cameras.append(Camera(c.name, Lens(c.width, c.height, _np(c.K), _np(c.distortion)), Pose(_np(c.R), _np(c.t))))
+        where = "volume"
+        v = m.volume
+        volume = None if v is None else Volume(_np(v.center), _np(v.axes), _np(v.half_size))
+        where = "cameras"
+        return Rig(projector, tuple(cameras), volume, MappingProxyType(_extra(m)))
+    except RigError as e:
+        raise RigError(f"{path}: {where}: {e}") from None
+
+
+
+
+def _np(a: Any) -> F64:
+    return cast(F64, a)  # types.py makes and checks the array
+
+
+def _extra(m: _Rig) -> dict[str, Any]:
+    out: dict[str, Any] = dict(m.model_extra or {})
+    if m.projector.model_extra:
+        out["projector"] = dict(m.projector.model_extra)
+    cameras = {c.name: dict(c.model_extra) for c in m.cameras if c.model_extra}
+    if cameras:
+        out["cameras"] = cameras
+    if m.volume is not None and m.volume.model_extra:
+        out["volume"] = dict(m.volume.model_extra)
+    return out
+
+
+def rig_document(rig: Rig) -> dict[str, Any]:
+    """The rig as the JSON object of its file."""
+    extra = dict(rig.extra)
+    of_projector, of_cameras, of_volume = extra.pop("projector", {}), extra.pop("cameras", {}), extra.pop("volume", {})
+
+    def device(d: Camera | Projector) -> dict[str, Any]:
+        return {"K": d.lens.K.tolist(), "distortion": d.lens.distortion.tolist(), "R": d.pose.R.tolist(), "t": d.pose.t.tolist()}
+
+    p = rig.projector
+    doc: dict[str, Any] = {
+        "format": FORMAT, "version": VERSION, "units": "mm",
+        "projector": {"width": p.width, "height": p.height, "layout": p.layout.value, **device(p), **of_projector},
+        "cameras": [{"name": c.name, "width": c.lens.width, "height": c.lens.height, **device(c), **of_cameras.get(c.name, {})}
+                    for c in rig.cameras],
+    }
+    if rig.volume is not None:
+        v = rig.volume
+        doc["volume"] = {"center": v.center.tolist(), "axes": v.axes.tolist(), "half_size": v.half_size.tolist(), **of_volume}
+    return {**doc, **extra}
+
+
+def write_rig(path: Path | str, rig: Rig, *, force: bool = False) -> None:
+    """The rig as `rig.json`, with the keys that `Rig.extra` kept. Raises OutputError."""
+    with files.new_file(path, force=force) as tmp:
+        files.write_json(tmp, rig_document(rig))
+
+
+def hash_rig(path: Path | str) -> str:
+    """"sha256:..." of a rig's file, whatever its white space and the order of its keys. Raises FormatError."""
+    return files.canonical_hash(files.read_json(Path(path), "a rig"))
