@@ -293,8 +293,9 @@ def predict(
 
     `noise` is the sensor's (variance a + b I in codes squared), `modulation` B and `background` A what the pixel will
     see, in codes; `point` (3,) or (n, 3) in world mm, default the volume's centre. `response_error` as `order_error`.
-    sigma_depth = sigma_phi / |2 pi g . J|. Orders settled by Gray code are not predicted. Raises RigError if the rig lacks the camera, UsageError for a signal
-    that is not positive, CaptureError for a view without fringes.
+    sigma_depth = sigma_phi / |2 pi g . J|. Orders settled by Gray code are not predicted.
+    Raises RigError if the rig lacks the camera, UsageError for a signal that is not positive, CaptureError for a view
+    without fringes.
     """
     if not (modulation > 0 and background >= 0):
         raise UsageError(f"modulation {modulation} and background {background} codes; needed B > 0 and A >= 0")
@@ -369,7 +370,6 @@ def validate(planned: PatternPlan, rig: Rig, s: PatternSettings | None = None) -
             f"the plan is for {planned.projector_width} x {planned.projector_height} {planned.layout.value}, "
             f"the rig's projector is {p.width} x {p.height} {p.layout.value}"
         )
-    noise = NoiseModel(s.design_noise_a, s.design_noise_b)
     for view in planned.views:
         found += [f"{view.camera}: {what}" for what in _faults(rig, view, s)]
     return tuple(found)
