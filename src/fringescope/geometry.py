@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import distance_transform_edt
 
 from fringescope.errors import RigError
 from fringescope.kernels import lens as k
@@ -120,3 +121,114 @@ def field_of_view(rig: Rig, p_world: ArrayLike) -> Bool:
         with np.errstate(invalid="ignore"):
             ok &= (uv >= -0.5).all(-1) & (uv[..., 0] <= d.lens.width - 0.5) & (uv[..., 1] <= d.lens.height - 0.5)
     return ok
+
+
+def phase_at(projector: Projector, g: tuple[float, float], p_world: ArrayLike) -> F64:
+    """Phase (...,) in radians that the fringes of gradient `g` (cycles per plane unit) have at world points (..., 3)."""
+    uv = project(projector, p_world)
+    return np.asarray(2 * np.pi * (uv[..., 0] * g[0] + uv[..., 1] * g[1]))
+
+
+def measuring_space(rig: Rig, camera: Camera, p_world: ArrayLike, margin: float) -> Bool:
+    """Whether world points (..., 3) may carry a specimen seen by `camera`.
+
+    Inside the rig's volume, grown by `margin` (1.25 = a quarter larger), where the rig has one; else seen by projector
+    and camera, within 25 % of the working distance, and in the slab of heights that all devices see in common.
+    """
+    p = np.asarray(p_world, dtype=np.float64)
+    if rig.volume is not None:
+        v = rig.volume
+        return inside_volume(Volume(v.center, v.axes, v.half_size * margin), p)
+    only = Rig(rig.projector, (camera,))
+    ok = field_of_view(only, p)
+    mid, axis = working_point(rig), _looking(rig)
+    near, far = _common_slab(rig, mid, axis)
+    h = (p - mid) @ axis
+    return np.asarray(ok & (h >= near) & (h <= far))
+
+
+def _looking(rig: Rig) -> F64:
+    """Unit vector (3,) along which the devices look on the average, world."""
+    a = np.sum([d.pose.R[2] for d in rig.devices], axis=0)
+    return np.asarray(a / np.linalg.norm(a))
+
+
+def _common_slab(rig: Rig, mid: F64, axis: F64) -> tuple[float, float]:
+    """Heights along `axis` from `mid` at which some point is seen by all devices, at most 25 % of the distance."""
+    reach = 0.25 * float(np.mean([np.linalg.norm(centre(d.pose) - mid) for d in rig.devices]))
+    heights = np.linspace(-reach, reach, 101)
+    side = np.linalg.svd(np.eye(3) - np.outer(axis, axis))[0][:, :2].T
+    width = max(2 * np.linalg.norm(centre(d.pose) - mid) * d.lens.width / d.lens.K[0, 0] for d in rig.devices)
+    a = np.linspace(-width / 2, width / 2, 41)
+    plane = (a[:, None, None] * side[0] + a[None, :, None] * side[1]).reshape(-1, 3)
+    seen = [bool(field_of_view(rig, mid + h * axis + plane).any()) for h in heights]
+    if not any(seen):
+        raise RigError("projector and cameras share no view within 25 % of the working distance; check the poses")
+    ok = heights[np.array(seen)]
+    return float(ok.min()), float(ok.max())
+
+
+def phase_bounds(
+    rig: Rig, camera: Camera, g: tuple[float, float], margin: float, size: tuple[int, int] = (18, 26)
+) -> tuple[F64, F64]:
+    """Smallest and largest phase of gradient `g` that each ray of a camera can meet inside the measuring space.
+
+    Returns two arrays of `size` (h, w) that span the image corner on corner, radians. Rays that miss the space take
+    the bounds of the nearest ray that meets it. Raises RigError if none does.
+    """
+    h, w = size
+    L = camera.lens
+    v, u = np.meshgrid(np.linspace(0, L.height - 1, h), np.linspace(0, L.width - 1, w), indexing="ij")
+    origin, d = world_rays(camera, np.stack([u, v], -1))
+    if rig.volume is not None:
+        distance = float(np.linalg.norm(rig.volume.center - origin))
+        reach = margin * float(np.linalg.norm(rig.volume.half_size))
+    else:
+        distance = float(np.linalg.norm(working_point(rig) - origin))
+        reach = 0.5 * distance
+    t = np.linspace(max(distance - reach, 1e-3 * distance), distance + reach, 257)
+    p = origin + d[:, :, None, :] * t[:, None]
+    ok = measuring_space(rig, camera, p, margin)
+    phi = phase_at(rig.projector, g, p)
+    step = np.abs(np.diff(phi, axis=2)).max(axis=2)
+    ok &= np.isfinite(phi)
+    low = np.where(ok, phi, np.inf).min(axis=2) - step
+    high = np.where(ok, phi, -np.inf).max(axis=2) + step
+    missed = ~ok.any(axis=2)
+    if missed.all():
+        raise RigError(f"camera '{camera.name}' and the projector share no view in the measuring volume; check the rig")
+    if missed.any():
+        near = np.asarray(distance_transform_edt(missed.astype(np.uint8), return_distances=False, return_indices=True))
+        low, high = low[near[0], near[1]], high[near[0], near[1]]
+    return np.ascontiguousarray(low), np.ascontiguousarray(high)
+
+
+def epipolar_field(rig: Rig, camera: Camera, g: tuple[float, float], size: tuple[int, int] = (18, 26)) -> F64:
+    """Where the phase of gradient `g` must grow in a camera's image, if the fringes come straight from the projector.
+
+    Along the image of a projector ray the order of points is kept on every surface that faces both devices; the
+    derivative of the phase along that epipolar direction has one sign. Returns (h, w, 3): the unit direction (du, dv)
+    in camera pixels along which the phase grows, and the growth in radians per pixel on a surface that faces both.
+    """
+    h, w = size
+    L = camera.lens
+    v, u = np.meshgrid(np.linspace(0, L.height - 1, h), np.linspace(0, L.width - 1, w), indexing="ij")
+    uv = np.stack([u, v], -1)
+    origin = centre(camera.pose)
+    mid = rig.volume.center if rig.volume is not None else working_point(rig)
+    projector_centre = centre(rig.projector.pose)
+    to_camera, to_projector = origin - mid, projector_centre - mid
+    n = to_camera / np.linalg.norm(to_camera) + to_projector / np.linalg.norm(to_projector)
+    n /= np.linalg.norm(n)
+
+    def on_plane(q: F64) -> F64:
+        o, r = world_rays(camera, q)
+        return np.asarray(o + r * (((mid - o) @ n) / (r @ n))[..., None])
+
+    p = on_plane(uv)
+    away = p - projector_centre
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    e = project(camera, p + away) - project(camera, p - away)
+    e /= np.linalg.norm(e, axis=-1, keepdims=True)
+    slope = phase_at(rig.projector, g, on_plane(uv + e)) - phase_at(rig.projector, g, on_plane(uv - e))
+    return np.concatenate([e * np.sign(slope)[..., None], np.abs(slope)[..., None] / 2], axis=-1)

@@ -44,10 +44,11 @@ class _Section:
 class PhaseSettings(_Section):
     """Frames to absolute phase (II-C)."""
 
+    systematic_rad: float = knob(0.05, "rad", "phase error that noise does not explain (response, defocus); added to sigma when orders are weighed", "II-C", 0, 1)
     order_min_margin: float = knob(3.0, "sigma", "an order is uncertain if the next one fits less than this many standard deviations worse", "II-C", 0)
-    order_max_residual: float = knob(6.0, "sigma", "an order is uncertain if the coarse phase misses the fine one by more than this", "II-C", 0)
     order_votes: int = knob(5, "pixels", "side of the window in which neighbours vote on a pixel's order; 1 = no vote", "II-C", 1, 31)
     order_majority: float = knob(0.7, "", "share of the votes that repairs an order", "II-C", 0.5, 1)
+    max_sigma_rad: float = knob(0.5, "rad", "pixels whose phase is noisier than this do not vote on orders", "II-C", 0)
     max_misfit: float = knob(6.0, "sigma", "N-step samples that miss the fitted sinusoid by more than this are inconsistent frames", "", 0)
     max_saturated: int = knob(0, "samples", "saturated samples of the finest set that a pixel may have", "III-D", 0)
 

@@ -1,0 +1,495 @@
+"""Frames to absolute phase (II-C, equations 3 to 5): one by one into sums, then phase, noise, and the order.
+
+Captures may hold any direction, any number of steps, HDR brackets and Gray code. Bayer frames are decoded on their raw
+sites: the phase does not depend on a site's colour, so no demosaicing ever mixes pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from fringescope import geometry
+from fringescope.errors import CaptureError, DecodeError
+from fringescope.kernels import fringes as k
+from fringescope.settings import PhaseSettings
+from fringescope.types import (
+    F32,
+    F64,
+    U16,
+    AnyArray,
+    Decoded,
+    Direction,
+    FrameKey,
+    FringeSet,
+    GrayCode,
+    GraySet,
+    NoiseModel,
+    PixelFormat,
+    Reason,
+    Rig,
+    Role,
+    ViewPlan,
+    WrappedSet,
+)
+
+PARALLEL_RAD = 1e-4  #: sets whose gradients differ less than this in angle (either sign) unwrap each other
+
+
+# ------------------------------------------------------------------------------------------------- frames into sums
+
+
+def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
+    """One sample per pixel: raw Bayer and mono frames as they are, RGB as the sum of its channels (uint16).
+
+    A pixel with one saturated channel counts as saturated: it gets the largest sum.
+    """
+    if frame.ndim == 2:
+        return np.ascontiguousarray(frame)
+    total: AnyArray = frame.astype(np.uint16).sum(axis=2, dtype=np.uint16)
+    total[(frame >= pixel_format.max_value).any(axis=2)] = 3 * pixel_format.max_value
+    return total
+
+
+def full_scale(pixel_format: PixelFormat) -> int:
+    """The code at which a sample of `intensity` is saturated."""
+    return pixel_format.max_value * (3 if pixel_format is PixelFormat.RGB8 else 1)
+
+
+class FringeSums:
+    """Accumulator of one N-step set: `add` its frames in any order, then `finish`. Holds sums, never frames."""
+
+    def __init__(self, fringe_set: FringeSet, max_value: int) -> None:
+        self.fringe_set = fringe_set
+        self.max_value = max_value
+        self._seen: set[int] = set()
+        self._sums: list[F32 | F64] = []
+        self._saturated = np.zeros((0, 0), np.uint8)
+
+    def add(self, n: int, frame: AnyArray) -> None:
+        """Add frame n, (H, W) unsigned integers. Raises CaptureError for a second frame n or another size."""
+        N = self.fringe_set.steps
+        if n in self._seen or not 0 <= n < N:
+            raise CaptureError(f"frame {n} of a {N}-step set came twice or is out of range; each of 0..{N - 1} once")
+        if not self._sums:
+            kind = np.float32 if self.max_value < 1024 else np.float64
+            self._sums = [np.zeros(frame.shape, kind) for _ in range(4)]
+            self._saturated = np.zeros(frame.shape, np.uint8)
+        if frame.shape != self._saturated.shape:
+            raise CaptureError(
+                f"frame {n} is {frame.shape[1]} x {frame.shape[0]} pixels; the set began with "
+                f"{self._saturated.shape[1]} x {self._saturated.shape[0]}"
+            )
+        delta = 2 * math.pi * n / N
+        k.accumulate(frame, math.cos(delta), math.sin(delta), self.max_value, *self._sums, self._saturated)
+        self._seen.add(n)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every frame has come."""
+        return len(self._seen) == self.fringe_set.steps
+
+    def finish(self) -> tuple[WrappedSet, F32]:
+        """The wrapped set, its `sigma` not yet filled (NaN), and the sample variance (H, W) about the sinusoid.
+
+        Raises CaptureError if frames are missing.
+        """
+        N = self.fringe_set.steps
+        missing = sorted(set(range(N)) - self._seen)
+        if missing:
+            raise CaptureError(f"a {N}-step set got {len(self._seen)} frames; missing {missing}")
+        shape = self._saturated.shape
+        phase, background, modulation, variance = (np.empty(shape, np.float32) for _ in range(4))
+        k.wrap(*self._sums, N, phase, background, modulation, variance)
+        self._sums = []
+        nan = np.full(shape, np.nan, np.float32)
+        g = (float(self.fringe_set.cycles_per_pixel[0]), float(self.fringe_set.cycles_per_pixel[1]))
+        return WrappedSet(g, N, phase, background, modulation, nan, self._saturated, nan), variance
+
+
+class GrayBits:
+    """Accumulator of one Gray code; frames in any order, kept until `finish` (they are few)."""
+
+    def __init__(self, gray_set: GraySet) -> None:
+        self.gray_set = gray_set
+        self._frames: dict[tuple[Role, int], AnyArray] = {}
+
+    def add(self, role: Role, n: int, frame: AnyArray) -> None:
+        """Add one frame (H, W). Raises CaptureError for another size."""
+        for other in self._frames.values():
+            if other.shape != frame.shape:
+                raise CaptureError(
+                    f"a Gray code frame is {frame.shape[1]} x {frame.shape[0]} pixels; the set began with "
+                    f"{other.shape[1]} x {other.shape[0]}"
+                )
+            break
+        self._frames[role, n] = frame
+
+    def finish(self, noise: NoiseModel) -> GrayCode:
+        """Decode: each bit against its inverse, or the mean of white and black, or the mean of all bits."""
+        s, f = self.gray_set, self._frames
+        missing = [n for n in range(s.bits) if (Role.BIT, n) not in f]
+        if missing:
+            raise CaptureError(f"a Gray code of {s.bits} frames lacks {missing}")
+        first = f[Role.BIT, 0]
+        none = np.zeros((0, 0), first.dtype)
+        if (Role.WHITE, 0) in f and (Role.BLACK, 0) in f:
+            threshold = 0.5 * (f[Role.WHITE, 0].astype(np.float32) + f[Role.BLACK, 0].astype(np.float32))
+        else:
+            bits = [f[Role.BIT, n].astype(np.float32) for n in range(s.bits)]
+            threshold = 0.5 * (np.maximum.reduce(bits) + np.minimum.reduce(bits))
+        code = np.zeros(first.shape, np.int32)
+        contrast = np.zeros(first.shape, np.float32)
+        level = math.sqrt(noise.a + noise.b * float(np.median(threshold)))
+        for n in range(s.bits):
+            inverse = f.get((Role.INVERSE, n), none)
+            k.gray_bit(f[Role.BIT, n], inverse, threshold.astype(np.float32), 2.0 * level, n, code, contrast)
+        self._frames = {}
+        return GrayCode(s.axis, s.cell, code, contrast)
+
+
+# ------------------------------------------------------------------------------------------------------- the noise
+
+
+def estimate_noise(measured: Sequence[tuple[WrappedSet, F32]], max_value: int) -> NoiseModel:
+    """Sensor noise `variance = a + b I` from the capture itself: the residuals about the sinusoids of sets with N > 3.
+
+    In bins of the background the median residual (a chi-squared of N - 3 degrees of freedom) stands for the variance;
+    a line through the bins gives a and b. With three steps only, the backgrounds of two sets of one exposure differ
+    by noise alone and serve instead. Falls back to 0.6 codes of read noise and b = 0.03 of the 8-bit scale.
+    """
+    levels: list[float] = []
+    variances: list[float] = []
+    weights: list[float] = []
+    residual_sets = [(w, v) for w, v in measured if w.steps > 3]
+    samples: list[tuple[AnyArray, AnyArray, float, int]] = []
+    for w, v in residual_sets:
+        dof = w.steps - 3
+        samples.append((w.background, v, _chi2_median(dof), dof))
+    if not samples:
+        for (w1, _), (w2, _) in pairwise(measured):
+            if w1.background.shape == w2.background.shape:
+                d = (w1.background - w2.background).astype(np.float64)
+                d -= np.median(d)
+                samples.append((w1.background, d * d / (1 / w1.steps + 1 / w2.steps), _chi2_median(1), 1))
+    for A, v, median_factor, dof in samples:
+        ok = (0.01 * max_value < A) & (0.9 * max_value > A)
+        for w, _ in residual_sets:
+            if w.saturated.shape == ok.shape:
+                ok &= w.saturated == 0
+        if ok.sum() < 400:
+            continue
+        a, x = A[ok], v[ok]
+        edges = np.unique(np.quantile(a, np.linspace(0, 1, 25)))
+        where = np.clip(np.searchsorted(edges, a, side="right") - 1, 0, len(edges) - 2)
+        for b in range(len(edges) - 1):
+            inside = where == b
+            if inside.sum() >= 50:
+                levels.append(float(a[inside].mean()))
+                variances.append(float(np.median(x[inside])) / median_factor)
+                weights.append(float(inside.sum()) * dof)
+    floor = 1.0 / 12.0
+    if len(levels) < 3:
+        scale = max_value / 255.0
+        return NoiseModel(0.36 * scale * scale, 0.03 * scale, "default")
+    x, y, w = np.array(levels), np.array(variances), np.array(weights)
+    w = w / np.maximum(y, floor) ** 2
+    for _ in range(5):  # iteratively reweighted: bins spoilt by motion or gamma lie above the line
+        M = np.stack([np.ones_like(x), x], 1)
+        a, b = np.linalg.lstsq(M * np.sqrt(w)[:, None], y * np.sqrt(w), rcond=None)[0]
+        if b < 0:
+            a, b = float(np.average(y, weights=w)), 0.0
+        if a < floor:
+            a, b = floor, max(float(np.sum(w * x * (y - floor)) / np.sum(w * x * x)), 0.0)
+        r = (y - a - b * x) / np.maximum(a + b * x, floor)
+        scale = 1.4826 * float(np.median(np.abs(r))) + 1e-3
+        w = np.array(weights) / np.maximum(a + b * x, floor) ** 2 / (1 + (r / (3 * scale)) ** 2)
+    return NoiseModel(float(a), float(b), "residuals")
+
+
+def _chi2_median(dof: int) -> float:
+    """Median over mean of a chi-squared variable (Wilson and Hilferty; exact 0.4549 for one degree of freedom)."""
+    return 0.45494 if dof == 1 else (1 - 2 / (9 * dof)) ** 3
+
+
+# ------------------------------------------------------------------------------------------------------- measuring
+
+
+def measure(
+    frames: Iterable[tuple[FrameKey, AnyArray]], plan: ViewPlan, s: PhaseSettings, noise: NoiseModel | None = None
+) -> Decoded:
+    """Frames, as they come, to wrapped phases with sigma; `directions` is still empty (see `settle_order`).
+
+    Raises CaptureError if frames are missing, doubled or of different sizes.
+    """
+    top = full_scale(plan.pixel_format)
+    sums: dict[int, FringeSums] = {}
+    bits: dict[int, GrayBits] = {}
+    done: dict[int, tuple[WrappedSet, F32]] = {}
+    for key, frame in frames:
+        one = plan.sets[key.set_index]
+        if isinstance(one, FringeSet):
+            acc = sums.setdefault(key.set_index, FringeSums(one, top))
+            acc.add(key.number, intensity(frame, plan.pixel_format))
+            if acc.complete:
+                done[key.set_index] = sums.pop(key.set_index).finish()
+        else:
+            bits.setdefault(key.set_index, GrayBits(one)).add(
+                key.role, key.number, intensity(frame, plan.pixel_format)
+            )
+    for acc in sums.values():
+        acc.finish()  # raises: frames are missing
+    absent = [i for i in range(len(plan.sets)) if i not in done and i not in bits]
+    if absent:
+        raise CaptureError(f"view '{plan.camera}': no frames came for set {absent[0]} of {len(plan.sets)}")
+    measured = [done[i] for i in sorted(done)]
+    shapes = {w.phase.shape for w, _ in measured}
+    if len(shapes) > 1:
+        sizes = ", ".join(f"{c} x {r}" for r, c in sorted(shapes))
+        raise CaptureError(f"view '{plan.camera}': sets of different sizes: {sizes}; needed one size")
+    noise = noise or estimate_noise(measured, top)
+    gray = tuple(bits[i].finish(noise) for i in sorted(bits))
+    sets = _merge([_with_sigma(w, v, noise) for w, v in measured], plan, sorted(done), s)
+    if sets:
+        finest = min(sets, key=lambda w: float(np.median(w.sigma)) / math.hypot(*w.g))
+        background, modulation = finest.background, finest.modulation
+        reasons = np.zeros(background.shape, np.uint16)
+        for w in sets:
+            if w.steps > 3:
+                reasons[w.misfit > s.max_misfit] |= np.uint16(Reason.INCONSISTENT)
+    else:
+        background = modulation = gray[0].contrast
+        reasons = np.zeros(background.shape, np.uint16)
+    return Decoded(plan.camera, (), tuple(sets), gray, background, modulation, reasons, noise)
+
+
+def _with_sigma(w: WrappedSet, variance: F32, noise: NoiseModel) -> WrappedSet:
+    sigma = np.empty_like(w.phase)
+    k.phase_sigma(w.phase, w.background, w.modulation, w.steps, noise.a, noise.b, sigma)
+    with np.errstate(invalid="ignore"):
+        misfit = np.sqrt(variance / (noise.a + noise.b * np.maximum(w.background, 0))).astype(np.float32)
+    return replace(w, sigma=sigma, misfit=misfit)
+
+
+def _merge(sets: list[WrappedSet], plan: ViewPlan, index: Sequence[int], s: PhaseSettings) -> list[WrappedSet]:
+    """HDR: sets of equal g and different exposure become one, per pixel by sigma."""
+    groups: dict[tuple[float, float, int], list[WrappedSet]] = {}
+    for w, i in zip(sets, index, strict=True):
+        one = plan.sets[i]
+        bracket = isinstance(one, FringeSet) and one.exposure_us is not None
+        groups.setdefault((*w.g, -1 if bracket else i), []).append(w)
+    out = []
+    for group in groups.values():
+        if len(group) == 1:
+            out.append(group[0])
+            continue
+        merged = np.empty((5, *group[0].phase.shape), np.float32)
+        stack = [np.stack([getattr(w, name) for w in group]) for name in ("phase", "background", "modulation", "sigma")]
+        k.merge_brackets(*stack, np.stack([w.saturated for w in group]), s.max_saturated, merged)
+        phase, background, modulation, sigma, saturated = merged
+        misfit = np.where(saturated > 0, np.nan, np.fmin.reduce([w.misfit for w in group]))
+        out.append(
+            WrappedSet(
+                group[0].g, group[0].steps, phase, background, modulation, sigma, saturated.astype(np.uint8),
+                misfit.astype(np.float32),
+            )
+        )
+    return out
+
+
+# ------------------------------------------------------------------------------------------------------- the order
+
+
+def families(sets: Sequence[WrappedSet]) -> list[list[WrappedSet]]:
+    """Sets grouped by direction (parallel within 1e-4 rad, either sign), each group coarse to fine.
+
+    Sets that point the other way than the finest of their group are turned round (phase and gradient negated).
+    """
+    groups: list[list[WrappedSet]] = []
+    for w in sorted(sets, key=lambda w: -math.hypot(*w.g)):
+        for group in groups:
+            a, b = group[0].g, w.g
+            na, nb = math.hypot(*a), math.hypot(*b)
+            if abs(a[0] * b[1] - a[1] * b[0]) < PARALLEL_RAD * na * nb:
+                if a[0] * b[0] + a[1] * b[1] < 0:
+                    w = replace(w, g=(-b[0], -b[1]), phase=-w.phase)
+                group.append(w)
+                break
+        else:
+            groups.append([w])
+    return [g[::-1] for g in groups]
+
+
+def field_bounds(g: tuple[float, float], plane: tuple[int, int], margin: float = 0.01) -> tuple[float, float]:
+    """Smallest and largest phase of gradient `g` on the projector plane, grown by `margin` of the extent, radians."""
+    corners = [(u, v) for u in (-0.5, plane[0] - 0.5) for v in (-0.5, plane[1] - 0.5)]
+    phi = [2 * math.pi * (g[0] * u + g[1] * v) for u, v in corners]
+    grow = margin * (max(phi) - min(phi))
+    return min(phi) - grow, max(phi) + grow
+
+
+def unambiguous_span(group: Sequence[WrappedSet] | Sequence[FringeSet], tolerance_rad: float) -> float:
+    """Length along the gradient, plane units, over which the sets of one direction tell every order apart.
+
+    The smallest shift by whole coarsest periods that no finer set contradicts by more than `tolerance_rad`;
+    infinity where there is none within 1000 periods.
+    """
+    f = [math.hypot(*(w.g if isinstance(w, WrappedSet) else w.cycles_per_pixel)) for w in group]
+    for turns in range(1, 1001):
+        x = turns / f[0]
+        if all(abs(x * fi - round(x * fi)) * 2 * math.pi < tolerance_rad for fi in f[1:]):
+            return x
+    return math.inf
+
+
+def settle_order(
+    decoded: Decoded, plan: ViewPlan, s: PhaseSettings, rig: Rig | None = None, volume_margin: float = 1.25
+) -> Decoded:
+    """Wrapped phases to absolute phases, one `Direction` per fringe direction (equation 5, [33]).
+
+    Without a rig the projector's field bounds the orders. With a rig each camera ray bounds them by its way through the
+    measuring volume: this settles coarsest periods that wrap inside the field. Among the orders that are possible the
+    one with the least chi squared over all sets and Gray codes wins; neighbours then vote on single wrong orders.
+    Raises DecodeError if a direction has neither sets nor code that span the field (without a rig).
+    """
+    groups = families(decoded.sets)
+    out: list[Direction] = []
+    reasons = decoded.reasons.copy()
+    used: set[int] = set()
+    for group in groups:
+        g = group[-1].g
+        gray, half, soft = _gray_phase(decoded.gray, g, used)
+        if rig is None:
+            lo, hi = field_bounds(g, plan.projector_size)
+            low, high = np.full((2, 2), lo), np.full((2, 2), hi)
+            span = unambiguous_span(group, 4 * s.systematic_rad)
+            field = (hi - lo) / (2 * math.pi * math.hypot(*g))
+            if gray is None and span < 0.7 * field:
+                raise DecodeError(
+                    f"view '{plan.camera}': the sets along ({g[0]:.4g}, {g[1]:.4g}) repeat after {span:.0f} projector "
+                    f"units, the field is {field:.0f}; add a coarser period or a Gray code, or give a rig"
+                )
+        else:
+            low, high = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
+        direction, bad = _unwrap(group, low, high, gray, half, soft, s)
+        out.append(direction)
+        reasons |= bad
+    for i, code in enumerate(decoded.gray):
+        if i not in used:
+            direction, bad = _from_gray(code)
+            out.append(direction)
+            reasons |= bad
+    return replace(decoded, directions=tuple(out), reasons=reasons)
+
+
+def _unwrap(
+    group: Sequence[WrappedSet], low: F64, high: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
+) -> tuple[Direction, U16]:
+    phases = np.stack([w.phase for w in group])
+    sigmas = np.stack([np.hypot(w.sigma, np.float32(s.systematic_rad)) for w in group])
+    freq = np.array([math.hypot(*w.g) for w in group])
+    shape = phases.shape[1:]
+    absolute, margin, residual = (np.empty(shape, np.float32) for _ in range(3))
+    none = np.zeros((0, 0), np.float32)
+    k.unwrap(phases, sigmas, freq, low, high, none if gray is None else gray, half, soft, absolute, margin, residual)
+    uncertain = ~(margin >= s.order_min_margin)
+    if s.order_votes > 1:
+        trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)
+        absolute, changed = _elect(np.where(trusted, absolute, np.float32(np.nan)), absolute, s)
+        uncertain = np.where(changed == -128, True, uncertain & (changed == 0) & (margin < s.order_min_margin))
+    reasons = np.where(uncertain | ~np.isfinite(absolute), np.uint16(Reason.ORDER_UNCERTAIN), np.uint16(0))
+    return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons.astype(np.uint16)
+
+
+def _elect(voters: F32, absolute: F32, s: PhaseSettings) -> tuple[F32, AnyArray]:
+    """Repair single wrong orders by the vote of the neighbours, three rounds."""
+    slope = _usual_slope(voters)
+    radius = s.order_votes // 2
+    total = np.zeros(absolute.shape, np.int16)
+    current = voters
+    changed = np.zeros(absolute.shape, np.int8)
+    for _ in range(3):
+        nxt = np.empty_like(current)
+        k.order_votes(current, radius, max(3, (2 * radius + 1) ** 2 // 4), s.order_majority, slope, nxt, changed)
+        total += np.where(changed == -128, 0, changed)
+        current = nxt
+        if not ((changed != 0) & (changed != -128)).any():
+            break
+    repaired = np.where(np.isfinite(current), current, absolute)
+    return repaired.astype(np.float32), np.where(changed == -128, -128, np.clip(total, -127, 127))
+
+
+def _usual_slope(phase: F32) -> float:
+    """Largest believable phase slope, radians per pixel: four times the usual one, at most 1.2."""
+    usual = 0.0
+    for axis in (0, 1):
+        d = np.diff(phase, axis=axis)
+        d = d[np.isfinite(d)]
+        if d.size:
+            usual = max(usual, float(np.median(np.abs(d))))
+    return min(max(4 * usual, 0.2), 1.2)
+
+
+def _gray_phase(
+    codes: Sequence[GrayCode], g: tuple[float, float], used: set[int]
+) -> tuple[F32 | None, float, float]:
+    """The finest phase at the middle of each pixel's Gray cell, half a cell and the softness of its edge, radians."""
+    best: tuple[F32 | None, float, float] = (None, 0.0, 0.0)
+    cell = math.inf
+    for i, code in enumerate(codes):
+        along, across = (g[0], g[1]) if code.axis == "u" else (g[1], g[0])
+        if abs(across) > PARALLEL_RAD * abs(along):
+            continue
+        used.add(i)
+        if code.cell < cell:
+            cell = code.cell
+            u = -0.5 + (code.value + 0.5) * code.cell
+            phase = np.where(code.value >= 0, 2 * math.pi * along * u, np.nan).astype(np.float32)
+            half = math.pi * abs(along) * code.cell
+            best = (phase, half, 0.1 * half + 0.3)
+    return best
+
+
+def _from_gray(code: GrayCode) -> tuple[Direction, U16]:
+    """A Gray code alone is a direction too: one cycle per cell, uniform within the cell."""
+    g = (1.0 / code.cell, 0.0) if code.axis == "u" else (0.0, 1.0 / code.cell)
+    u = -0.5 + (code.value + 0.5) * code.cell
+    phase = np.where(code.value >= 0, 2 * math.pi * u / code.cell, np.nan).astype(np.float32)
+    sigma = np.full(phase.shape, 2 * math.pi / math.sqrt(12), np.float32)
+    reasons = np.where(code.value >= 0, np.uint16(0), np.uint16(Reason.ORDER_UNCERTAIN))
+    return Direction(g, phase, sigma, np.full(phase.shape, 99, np.float32)), reasons.astype(np.uint16)
+
+
+# ------------------------------------------------------------------------------------------- projector coordinates
+
+
+def projector_coordinates(decoded: Decoded) -> tuple[F32, F32]:
+    """Projector-plane coordinates u, v (H, W) of every pixel, without a rig; NaN where the directions do not tell.
+
+    Two or more directions give both (least squares weighted by sigma); one direction along u or v gives that one.
+    """
+    shape = decoded.shape
+    u, v = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
+    d = decoded.directions
+    if len(d) >= 2:
+        w = [1 / np.maximum(x.sigma.astype(np.float64), 1e-6) ** 2 for x in d]
+        y = [x.phase / (2 * math.pi) for x in d]
+        a = sum(wi * x.g[0] ** 2 for wi, x in zip(w, d, strict=True))
+        b = sum(wi * x.g[0] * x.g[1] for wi, x in zip(w, d, strict=True))
+        c = sum(wi * x.g[1] ** 2 for wi, x in zip(w, d, strict=True))
+        p = sum(wi * x.g[0] * yi for wi, x, yi in zip(w, d, y, strict=True))
+        q = sum(wi * x.g[1] * yi for wi, x, yi in zip(w, d, y, strict=True))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            det = a * c - b * b
+            u, v = ((c * p - b * q) / det).astype(np.float32), ((a * q - b * p) / det).astype(np.float32)
+    else:
+        g = d[0].g
+        if abs(g[1]) < PARALLEL_RAD * abs(g[0]):
+            u = (d[0].phase / (2 * math.pi * g[0])).astype(np.float32)
+        elif abs(g[0]) < PARALLEL_RAD * abs(g[1]):
+            v = (d[0].phase / (2 * math.pi * g[1])).astype(np.float32)
+    return u, v
