@@ -12,20 +12,38 @@ from fringescope.store.capture import (
 )
 from fringescope.store.files import new_file, new_folder
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
+from fringescope.store.scan import (
+    StoredScan,
+    lost,
+    plain,
+    put_decoded,
+    put_scan,
+    read_scan,
+    write_decoded,
+    write_scan,
+)
 
 __all__ = [
     "Capture",
     "CaptureView",
     "Frames",
+    "StoredScan",
     "hash_capture",
     "hash_rig",
+    "lost",
     "new_file",
     "new_folder",
+    "plain",
     "put_capture",
+    "put_decoded",
+    "put_scan",
     "read_capture",
     "read_rig",
+    "read_scan",
     "rig_document",
     "view_inputs",
     "write_capture",
+    "write_decoded",
     "write_rig",
+    "write_scan",
 ]

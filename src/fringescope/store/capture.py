@@ -131,8 +131,8 @@ class Frames:
             yield key, frame
 
     def __getitem__(self, key: FrameKey) -> AnyArray:
-        view = self._view
-        return Images(self._capture.folder).frame(view.files[view.plan.keys.index(key)], view.plan.pixel_format, view.size)
+        view, images = self._view, Images(self._capture.folder)
+        return images.frame(view.files[view.plan.keys.index(key)], view.plan.pixel_format, view.size)
 
 
 # ------------------------------------------------------------------------------------------------------------ reading
@@ -210,7 +210,7 @@ def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
         raise CaptureError("needed either \"cycles_per_pixel\" (fringes) or \"gray\" (Gray code)")
     if s.gray is not None:
         if s.cell is None:
-            raise CaptureError("a Gray code without \"cell\"; needed the width of one code value in projector-plane units")
+            raise CaptureError("a Gray code without \"cell\"; needed the width of one code value")
         if s.inverse is not None and len(s.inverse) != len(s.frames):
             raise CaptureError(f"{len(s.inverse)} inverse frames for {len(s.frames)} frames; needed as many")
         gray = GraySet(s.gray, s.cell, len(s.frames), s.inverse is not None, s.white is not None, s.black is not None)
@@ -259,7 +259,8 @@ def hash_capture(capture: Capture) -> str:
 
 
 def put_capture(
-    folder: Path, width: int, height: int, layout: Layout, views: Iterable[ViewInput], extra: Mapping[str, Any] | None = None
+    folder: Path, width: int, height: int, layout: Layout, views: Iterable[ViewInput],
+    extra: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes a capture into an existing folder, frame by frame as `views` hand them out (any order within a view).
 
@@ -295,7 +296,7 @@ def _put_view(folder: Path, view: ViewInput) -> dict[str, Any]:
         seen.add(key)
     if len(seen) < len(keys):
         missing = [i for i, k in enumerate(keys) if k not in seen]
-        raise CaptureError(f"view '{plan.camera}': {len(seen)} frames came, the plan needs {len(keys)}; missing {missing[:8]}")
+        raise CaptureError(f"view '{plan.camera}': {len(seen)} frames came, not {len(keys)}; missing {missing[:8]}")
     entry: dict[str, Any] = {"camera": plan.camera, "pixel_format": plan.pixel_format.value, "sets": []}
     for i, s in enumerate(plan.sets):
         of = {(k.role, k.number): names[k] for k in keys if k.set_index == i}

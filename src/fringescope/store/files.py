@@ -1,7 +1,7 @@
 """Outputs that appear whole or not at all: folders and files are written beside their place and renamed into it.
 
 A folder that we write holds a *marker*, the JSON file that says what it is (`capture.json`, `scan.json`, ...). `force`
-replaces a folder only if it holds the marker of what is being written: a scan never replaces a capture, nor a home folder.
+replaces a folder only if it holds the marker of what is being written: a scan never replaces a capture.
 """
 
 from __future__ import annotations
@@ -71,22 +71,23 @@ def _check_target_folder(path: Path, marker: str, force: bool) -> None:
     if not os.path.lexists(path):
         return
     if not path.is_dir():
-        raise OutputError(f"{path}: is a file; needed a new folder: choose another --out")
+        raise OutputError(f"{path}: is a file; needed a new folder")
     if not any(path.iterdir()):
         return
     if not (path / marker).is_file():
-        raise OutputError(f"{path}: holds other files (no {marker}); needed a new or empty folder: choose another --out")
+        raise OutputError(f"{path}: holds other files (no {marker}); choose a new or empty folder")
     if not force:
-        raise OutputError(f"{path}: already holds a {Path(marker).stem}; choose another --out, or add --force to replace it")
+        raise OutputError(f"{path}: already holds a {Path(marker).stem}; choose another folder, or add --force")
 
 
 @contextmanager
 def new_folder(path: Path | str, *, marker: str, force: bool = False) -> Iterator[Path]:
     """A folder that appears whole at the end of the block, or not at all.
 
-    Yields a temporary sibling to write into. `marker` names the file that says what the folder holds; with `force` a folder that
-    holds that marker is replaced, and stays as it was until the new one is whole. Raises OutputError where `path` is
-    a file, holds other files, or holds the marker without `force`; and for any OSError in the block (disk full, no permission).
+    Yields a temporary sibling to write into. `marker` names the file that says what the folder holds; with `force` a
+    folder that holds that marker is replaced, and stays as it was until the new one is whole. Raises OutputError where
+    `path` is a file, holds other files, or holds the marker without `force`; and for any OSError in the block (disk
+    full, no permission).
     """
     path = Path(path)
     try:
@@ -122,12 +123,12 @@ def _swap(work: Path, target: Path) -> None:
     old: Path | None = None
     if target.exists():
         old = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".old", dir=target.parent))
-        os.replace(target, old / "was")
+        target.replace(old / "was")
     try:
-        os.replace(work, target)
+        work.replace(target)
     except BaseException:
         if old is not None:
-            os.replace(old / "was", target)
+            (old / "was").replace(target)
             old.rmdir()
         raise
     _sync_folder(target.parent)
@@ -155,13 +156,14 @@ def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
     work: Path | None = None
     try:
         try:
-            fd, name = tempfile.mkstemp(prefix=f".{target.stem[:80]}.", suffix=f".part{target.suffix}", dir=target.parent)
+            prefix, suffix = f".{target.stem[:80]}.", f".part{target.suffix}"
+            fd, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=target.parent)
             os.close(fd)
             work = Path(name)
             yield work
             work.chmod(_umask_mode(0o666))
             _sync(work)
-            os.replace(work, target)
+            work.replace(target)
             _sync_folder(target.parent)
         except OSError as e:
             raise OutputError(f"{path}: cannot write: {_why(e)}") from e
@@ -178,7 +180,7 @@ def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """The JSON object in a file; `what` names it in errors ("a rig"). Raises FormatError, also where the file is missing."""
+    """The JSON object in a file; `what` names it in errors ("a rig"). Raises FormatError, also for a missing file."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -206,7 +208,7 @@ def check_format(doc: Mapping[str, Any], path: Path, format_: str, version: int)
     if isinstance(v, bool) or not isinstance(v, int) or v < 1:
         raise FormatError(f"{path}: \"version\" is {shown(v)}; needed a whole number from 1 to {version}")
     if v > version:
-        raise FormatError(f"{path}: version {shown(v)} is newer than this program reads ({version}); update fringescope")
+        raise FormatError(f"{path}: version {shown(v)} is higher than this program reads ({version}); update it")
 
 
 def shown(value: object, length: int = 60) -> str:
@@ -223,9 +225,19 @@ def write_json(path: Path, doc: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(doc, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def _numbers(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _numbers(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_numbers(v) for v in value]
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1 << 53:
+        return float(value)
+    return value
+
+
 def canonical_hash(doc: Mapping[str, Any]) -> str:
-    """"sha256:..." of a JSON object, whatever its white space and the order of its keys."""
-    text = json.dumps(doc, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    """"sha256:..." of a JSON object, whatever its white space, order of keys and spelling of numbers."""
+    text = json.dumps(_numbers(doc), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return "sha256:" + hashlib.sha256(text.encode("ascii")).hexdigest()
 
 

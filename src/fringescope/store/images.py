@@ -95,7 +95,7 @@ class Images:
             head = _tiff_header(self._page(file, page), path)
         else:
             raise CaptureError(f"{path}: {_not_an_image(start)}; needed a PNG or TIFF frame")
-        if not (0 < head.width and 0 < head.height and head.width * head.height <= _MAX_PIXELS):
+        if not (head.width > 0 and head.height > 0 and head.width * head.height <= _MAX_PIXELS):
             raise CaptureError(f"{path}: size {head.width} x {head.height}; needed 1 to {_MAX_PIXELS} pixels")
         return head
 
@@ -112,6 +112,12 @@ class Images:
         if data[:4] in _TIFF:
             return _tiff_array(self._page(file, page, data), path)
         raise CaptureError(f"{path}: {_not_an_image(data)}; needed a PNG or TIFF frame")
+
+    def array(self, name: str) -> AnyArray:
+        """An array that we wrote ourselves as TIFF or PNG, floats too. Raises CaptureError if it cannot be had."""
+        if name.endswith(".png"):
+            return self.raw(name)
+        return _tiff_array(self._page(name, None), self.folder / name, "uif")
 
     def frame(self, name: str, pixel_format: PixelFormat, size: tuple[int, int] | None = None) -> AnyArray:
         """One frame, checked against its pixel format and, where given, the (width, height) of its view.
@@ -162,19 +168,32 @@ def _not_an_image(data: bytes) -> str:
     return "not an image that we read"
 
 
-def _tiff_header(page: tifffile.TiffPage, path: Path) -> Header:
-    if page.dtype is None or page.dtype.kind != "u":
+def _tiff_header(page: tifffile.TiffPage, path: Path, kinds: str = "u") -> Header:
+    if page.dtype is None or page.dtype.kind not in kinds:
         raise CaptureError(f"{path}: samples of type {page.dtype}; needed unsigned 8 or 16 bits")
     return Header(page.imagewidth, page.imagelength, page.samplesperpixel, int(page.bitspersample))
 
 
-def _tiff_array(page: tifffile.TiffPage, path: Path) -> AnyArray:
-    head = _tiff_header(page, path)
+def _lzw(page: tifffile.TiffPage) -> AnyArray:
+    """LZW, for which tifffile would need another package."""
+    handle = page.parent.filehandle
+    handle.seek(0)
+    data, which = np.frombuffer(handle.read(), np.uint8), (page.index, page.index + 1)
+    ok, pages = cv2.imdecodemulti(data, cv2.IMREAD_UNCHANGED, range=which)
+    if not ok:
+        raise ValueError("LZW data cannot be decoded")
+    a: AnyArray = pages[0]
+    return a if a.ndim == 2 else np.ascontiguousarray(a[..., ::-1])
+
+
+def _tiff_array(page: tifffile.TiffPage, path: Path, kinds: str = "u") -> AnyArray:
+    head = _tiff_header(page, path, kinds)
+    how = tifffile.COMPRESSION(page.compression)
     try:
-        a: AnyArray = np.asarray(page.asarray())
+        a: AnyArray = np.asarray(_lzw(page) if how is tifffile.COMPRESSION.LZW else page.asarray())
     except Exception as e:
         if "imagecodecs" in str(e):
-            raise CaptureError(f"{path}: TIFF compression {page.compression!r} is not read; save it uncompressed or as deflate") from e
+            raise CaptureError(f"{path}: TIFF compressed as {how.name}; save it uncompressed or as deflate") from e
         raise CaptureError(f"{path}: truncated or unreadable TIFF ({_first_line(e)})") from e
     if a.ndim == 3 and a.shape[0] == head.channels and a.shape[-1] != head.channels:
         a = np.moveaxis(a, 0, -1)
@@ -184,7 +203,7 @@ def _tiff_array(page: tifffile.TiffPage, path: Path) -> AnyArray:
 
 
 def decode_png(data: bytes, path: Path) -> AnyArray:
-    """A PNG's samples, (H, W) or (H, W, channels) in RGB order. Every chunk is checked, since decoders forgive truncation."""
+    """A PNG's samples, (H, W) or (H, W, channels) in RGB order; each chunk is checked, since decoders forgive."""
     pos, done = len(_PNG), False
     while pos + 12 <= len(data) and not done:
         length, kind = struct.unpack(">I4s", data[pos : pos + 8])
@@ -196,7 +215,7 @@ def decode_png(data: bytes, path: Path) -> AnyArray:
         pos, done = end, kind == b"IEND"
     if not done:
         raise CaptureError(f"{path}: truncated PNG ({len(data)} bytes, no end); copy it again from the camera")
-    w, h, bits, kind_ = struct.unpack(">IIBB", data[16:26])
+    w, h, bits = struct.unpack(">IIB", data[16:25])
     if w * h > _MAX_PIXELS:
         raise CaptureError(f"{path}: size {w} x {h}; needed 1 to {_MAX_PIXELS} pixels")
     if bits < 8:
@@ -219,12 +238,14 @@ def check_header(head: Header, fmt: PixelFormat, size: tuple[int, int] | None, n
     """Refuses a frame by what its file says of itself. Raises CaptureError."""
     need = 8 if fmt.bits <= 8 else 16
     if head.bits != need:
-        raise CaptureError(f"{name}: {head.bits}-bit file; {fmt.value} needs {need} bits per sample: mend \"pixel_format\" or the file")
+        came = f"{head.bits}-bit file"
+        raise CaptureError(f"{name}: {came}; {fmt.value} needs {need} bits: mend \"pixel_format\" or the file")
     if head.channels not in (1, 3) or (fmt is PixelFormat.RGB8 and head.channels != 3):
         need_c = 3 if fmt is PixelFormat.RGB8 else 1
         raise CaptureError(f"{name}: {head.channels} channels; {fmt.value} needs {need_c}")
     if size is not None and (head.width, head.height) != size:
-        raise CaptureError(f"{name}: {head.width} x {head.height} pixels; the view's other frames have {size[0]} x {size[1]}")
+        came, need_size = f"{head.width} x {head.height}", f"{size[0]} x {size[1]}"
+        raise CaptureError(f"{name}: {came} pixels; the view's other frames have {need_size}")
 
 
 def check_frame(a: AnyArray, fmt: PixelFormat, size: tuple[int, int] | None, name: str) -> AnyArray:
@@ -233,15 +254,15 @@ def check_frame(a: AnyArray, fmt: PixelFormat, size: tuple[int, int] | None, nam
     check_header(Header(a.shape[1], a.shape[0], channels, 8 * a.dtype.itemsize), fmt, size, name)
     if fmt is not PixelFormat.RGB8 and channels == 3:
         if not ((a[..., 0] == a[..., 1]).all() and (a[..., 0] == a[..., 2]).all()):
-            raise CaptureError(f"{name}: a colour picture with channels that differ; {fmt.value} needs raw samples, one channel")
+            raise CaptureError(f"{name}: a colour picture; {fmt.value} needs raw samples in one channel")
         a = np.ascontiguousarray(a[..., 0])
     if fmt.bits > 8 and fmt.bits < 16:
         top = int(a.max())
         if top > fmt.max_value:
             shift = 16 - fmt.bits
-            left = not (a & ((1 << shift) - 1)).any()
-            hint = f"the samples look left-aligned: shift them right by {shift} (`fringescope import --left-aligned`)" if left else (
-                "mend \"pixel_format\" or the file")
+            hint = "mend \"pixel_format\" or the file"
+            if not (a & ((1 << shift) - 1)).any():
+                hint = f"they look left-aligned: shift them right by {shift} (`fringescope import --left-aligned`)"
             raise CaptureError(f"{name}: values up to {top}; {fmt.value} goes to {fmt.max_value}: {hint}")
     return a
 

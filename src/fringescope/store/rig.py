@@ -88,14 +88,14 @@ def read_rig(path: Path | str) -> Rig:
     try:
         p = m.projector
         w, h = (2 * p.width if layout is Layout.DIAMOND else p.width), p.height
-        projector = Projector(p.width, p.height, layout, Lens(w, h, _np(p.K), _np(p.distortion)), Pose(_np(p.R), _np(p.t)))
+        projector = Projector(p.width, p.height, layout, _lens(p, w, h), _pose(p))
         cameras = []
         for i, c in enumerate(m.cameras):
             where = f"cameras[{i}]"
             if bad := files.check_name(c.name):
                 raise RigError(f"name {files.shown(c.name)}: {bad}")
             where = f"camera '{c.name}'"
-            cameras.append(Camera(c.name, Lens(c.width, c.height, _np(c.K), _np(c.distortion)), Pose(_np(c.R), _np(c.t))))
+            cameras.append(Camera(c.name, _lens(c, c.width, c.height), _pose(c)))
         where = "volume"
         v = m.volume
         volume = None if v is None else Volume(_np(v.center), _np(v.axes), _np(v.half_size))
@@ -105,6 +105,14 @@ def read_rig(path: Path | str) -> Rig:
         raise RigError(f"{path}: {where}: {e}") from None
 
 
+
+
+def _lens(d: _Device, width: int, height: int) -> Lens:
+    return Lens(width, height, _np(d.K), _np(d.distortion))
+
+
+def _pose(d: _Device) -> Pose:
+    return Pose(_np(d.R), _np(d.t))
 
 
 def _np(a: Any) -> F64:
@@ -129,18 +137,22 @@ def rig_document(rig: Rig) -> dict[str, Any]:
     of_projector, of_cameras, of_volume = extra.pop("projector", {}), extra.pop("cameras", {}), extra.pop("volume", {})
 
     def device(d: Camera | Projector) -> dict[str, Any]:
-        return {"K": d.lens.K.tolist(), "distortion": d.lens.distortion.tolist(), "R": d.pose.R.tolist(), "t": d.pose.t.tolist()}
+        arrays = {"K": d.lens.K, "distortion": d.lens.distortion, "R": d.pose.R, "t": d.pose.t}
+        return {k: a.tolist() for k, a in arrays.items()}
 
     p = rig.projector
     doc: dict[str, Any] = {
         "format": FORMAT, "version": VERSION, "units": "mm",
         "projector": {"width": p.width, "height": p.height, "layout": p.layout.value, **device(p), **of_projector},
-        "cameras": [{"name": c.name, "width": c.lens.width, "height": c.lens.height, **device(c), **of_cameras.get(c.name, {})}
-                    for c in rig.cameras],
+        "cameras": [
+            {"name": c.name, "width": c.lens.width, "height": c.lens.height, **device(c), **of_cameras.get(c.name, {})}
+            for c in rig.cameras
+        ],
     }
     if rig.volume is not None:
         v = rig.volume
-        doc["volume"] = {"center": v.center.tolist(), "axes": v.axes.tolist(), "half_size": v.half_size.tolist(), **of_volume}
+        box = {"center": v.center, "axes": v.axes, "half_size": v.half_size}
+        doc["volume"] = {**{k: a.tolist() for k, a in box.items()}, **of_volume}
     return {**doc, **extra}
 
 

@@ -1,0 +1,318 @@
+"""A scan's folder: scan.json, cloud.ply, surface.glb and the organised grids; and a decoded capture's folder.
+
+The PLY and GLB writers are handed in (`export.write_ply`, `export.write_glb`): files know data, not each other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import fringescope
+from fringescope.errors import FormatError
+from fringescope.store import files
+from fringescope.store.images import Images, write_png, write_tiff
+from fringescope.types import F32, U8, U16, Cloud, Decoded, Grid, Reason, Scan, Surface
+
+FORMAT, VERSION = "fringescope-scan", 1
+DECODED_FORMAT, DECODED_VERSION = "fringescope-decoded", 1
+
+WritePly = Callable[[Path, Cloud], None]
+WriteGlb = Callable[[Path, Surface, Mapping[str, Any]], None]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredScan:
+    """A scan read back: its folder, scan.json, and the grids of its views."""
+
+    folder: Path
+    document: Mapping[str, Any]
+    grids: tuple[Grid, ...]
+
+    @property
+    def cloud(self) -> Path:
+        """Its cloud.ply."""
+        return self.folder / "cloud.ply"
+
+    @property
+    def surface(self) -> Path | None:
+        """Its surface.glb, where it has one."""
+        path = self.folder / "surface.glb"
+        return path if path.is_file() else None
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold: arrays to lists, NaN and infinity to None, dataclasses to objects, others to text."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    return str(value)
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as f:
+        return "sha256:" + hashlib.file_digest(f, "sha256").hexdigest()
+
+
+# ------------------------------------------------------------------------------------------------------------ writing
+
+
+def put_scan(
+    folder: Path,
+    scan: Scan,
+    *,
+    settings: Mapping[str, Any],
+    capture_hash: str,
+    rig_hash: str,
+    write_ply: WritePly,
+    write_glb: WriteGlb,
+    times_s: Mapping[str, float] | None = None,
+    grids: bool = False,
+    all_points: Cloud | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Writes a scan into an existing folder and returns its scan.json.
+
+    `all_points` takes the place of the fused cloud in cloud.ply. `grids` writes the organised grids as TIFF and PNG,
+    otherwise they lie as .npy. `extra` adds keys to scan.json. "hash" identifies the scan: sha256 over the hashes of
+    capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
+    """
+    cloud = scan.cloud if all_points is None else all_points
+    write_ply(folder / "cloud.ply", cloud)
+    identity = {
+        "capture": capture_hash, "rig": rig_hash, "settings": plain(settings),
+        "software": fringescope.__version__, "cloud": _sha256(folder / "cloud.ply"),
+    }
+    hash_ = files.canonical_hash(identity)
+    if scan.surface is not None:
+        extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {fringescope.__version__}"}
+        write_glb(folder / "surface.glb", scan.surface, extras)
+    for g in scan.grids:
+        _put_grid(folder / g.camera, g, grids)
+    digests = {str(p.relative_to(folder).as_posix()): _sha256(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+    verdicts = {v.camera: plain(v) for v in scan.verdicts}
+    doc = {
+        "format": FORMAT,
+        "version": VERSION,
+        "hash": hash_,
+        "software": {"name": "fringescope", "version": fringescope.__version__},
+        "created": _now(),
+        "capture": capture_hash,
+        "rig": rig_hash,
+        "units": "mm",
+        "cloud": {"points": len(cloud), "kind": "fused" if all_points is None else "all-points"},
+        "surface": None if scan.surface is None else {
+            "vertices": len(scan.surface.vertices), "triangles": scan.surface.n_faces,
+            "textures": [list(p.texture.shape[1::-1]) for p in scan.surface.parts],
+        },
+        "grids": "tif" if grids else "npy",
+        "views": [
+            {"view": g.view, "camera": g.camera, "size": list(g.reasons.shape[::-1]), **verdicts.get(g.camera, {})}
+            for g in scan.grids
+        ],
+        "figures": plain(scan.figures),
+        "times_s": plain(times_s or {}),
+        "settings": plain(settings),
+        "files": digests,
+        **plain(extra or {}),
+    }
+    files.write_json(folder / files.SCAN, doc)
+    return doc
+
+
+def _put_grid(folder: Path, g: Grid, tif: bool) -> None:
+    folder.mkdir(exist_ok=True)
+    xyz, sigma = np.asarray(g.xyz, np.float32), np.asarray(g.sigma, np.float32)
+    reasons = np.asarray(g.reasons, np.uint16)
+    if tif:
+        write_tiff(folder / "xyz.tif", xyz)
+        write_tiff(folder / "sigma.tif", sigma)
+        write_png(folder / "reasons.png", reasons)
+        return
+    for name, a in (("xyz", xyz), ("sigma", sigma), ("reasons", reasons)):
+        with (folder / f"{name}.npy").open("wb") as f:
+            np.save(f, a)
+
+
+def write_scan(folder: Path | str, scan: Scan, *, force: bool = False, **how: Any) -> dict[str, Any]:
+    """A new scan folder, whole or not at all: `new_folder` with `put_scan`, whose arguments it takes."""
+    with files.new_folder(folder, marker=files.SCAN, force=force) as tmp:
+        return put_scan(tmp, scan, **how)
+
+
+# ------------------------------------------------------------------------------------------------------------ reading
+
+
+def read_scan(folder: Path | str, *, grids: bool = True, check: bool = True) -> StoredScan:
+    """A scan's folder read back; `grids=False` leaves the organised grids on disk, `check=False` the checksums unread.
+
+    Raises FormatError where it is no scan, of a higher version, or a file that scan.json lists is missing or changed.
+    """
+    folder = Path(folder)
+    path = folder / files.SCAN if folder.is_dir() else folder
+    doc = files.read_json(path, "a scan (a folder with scan.json)")
+    files.check_format(doc, path, FORMAT, VERSION)
+    folder = path.parent
+    listed = doc.get("files")
+    if not isinstance(listed, dict) or not isinstance(doc.get("views"), list):
+        raise FormatError(f"{path}: needed \"files\" and \"views\"")
+    for name, digest in listed.items():
+        if files.check_relative(name) is not None or not (folder / name).is_file():
+            raise FormatError(f"{folder}: {files.shown(name)} is missing; scan.json lists it: copy the whole folder")
+        if check and _sha256(folder / name) != digest:
+            raise FormatError(f"{folder / name}: changed since the scan was written; reconstruct it again")
+    out = [_read_grid(folder, entry, doc.get("grids") == "tif", path) for entry in doc["views"]] if grids else []
+    return StoredScan(folder, doc, tuple(out))
+
+
+def _read_grid(folder: Path, entry: Any, tif: bool, path: Path) -> Grid:
+    if not (isinstance(entry, dict) and isinstance(entry.get("camera"), str) and isinstance(entry.get("view"), int)):
+        raise FormatError(f"{path}: views: {files.shown(entry)}; needed camera and view")
+    camera = entry["camera"]
+    if bad := files.check_name(camera):
+        raise FormatError(f"{path}: views: camera {files.shown(camera)}: {bad}")
+    sub = folder / camera
+    if tif:
+        images = Images(sub)
+        xyz, sigma, reasons = (images.array(n) for n in ("xyz.tif", "sigma.tif", "reasons.png"))
+    else:
+        try:
+            xyz, sigma, reasons = (np.load(sub / f"{n}.npy", allow_pickle=False) for n in ("xyz", "sigma", "reasons"))
+        except (OSError, ValueError, EOFError) as e:
+            raise FormatError(f"{sub}: grids missing or broken: {str(e).splitlines()[0][:120]}") from e
+    h, w = reasons.shape[:2]
+    if xyz.shape != (h, w, 3) or sigma.shape != (h, w) or xyz.dtype != np.float32 or reasons.dtype != np.uint16:
+        raise FormatError(f"{sub}: grids of shapes {xyz.shape}, {sigma.shape}, {reasons.shape}; needed one size")
+    return Grid(entry["view"], camera, xyz, sigma, reasons)
+
+
+# ------------------------------------------------------------------------------------------------ a decoded capture
+
+
+def put_decoded(
+    folder: Path,
+    views: Iterable[tuple[Decoded, F32, F32]],
+    *,
+    settings: Mapping[str, Any],
+    capture_hash: str,
+    extra: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Writes decoded views, each with its projector coordinates (u, v), into an existing folder; returns decoded.json.
+
+    Per camera: phase_0.tif .. (one per direction, absolute radians), modulation, background, u, v (float32, NaN =
+    none), reasons.png (16 bits), and for people preview-*.png of each.
+    """
+    entries = []
+    for d, u, v in views:
+        sub = folder / d.camera
+        sub.mkdir()
+        layers = {f"phase_{i}": x.phase for i, x in enumerate(d.directions)}
+        layers |= {"modulation": d.modulation, "background": d.background, "u": u, "v": v}
+        for name, a in layers.items():
+            write_tiff(sub / f"{name}.tif", np.asarray(a, np.float32))
+            image = phase_picture(a) if name.startswith("phase") else picture(a, grey=name == "background")
+            write_png(sub / f"preview-{name}.png", image, 4)
+        write_png(sub / "reasons.png", np.asarray(d.reasons, np.uint16))
+        write_png(sub / "preview-reasons.png", reasons_picture(d.reasons), 4)
+        entries.append({
+            "camera": d.camera,
+            "size": list(d.shape[::-1]),
+            "directions": [{"cycles_per_pixel": list(x.g), "file": f"phase_{i}.tif",
+                            "valid": int(np.isfinite(x.phase).sum())} for i, x in enumerate(d.directions)],
+            "pixels": int(d.reasons.size),
+            "valid": int((d.reasons == 0).sum()),
+            "lost": lost(d.reasons),
+            "noise": plain(d.noise),
+        })
+    doc = {
+        "format": DECODED_FORMAT, "version": DECODED_VERSION,
+        "software": {"name": "fringescope", "version": fringescope.__version__}, "created": _now(),
+        "capture": capture_hash, "views": entries, "settings": plain(settings), **plain(extra or {}),
+    }
+    files.write_json(folder / files.DECODED, doc)
+    return doc
+
+
+def write_decoded(
+    folder: Path | str, views: Iterable[tuple[Decoded, F32, F32]], *, force: bool = False, **how: Any
+) -> dict[str, Any]:
+    """A new folder of a decoded capture, whole or not at all: `new_folder` with `put_decoded`."""
+    with files.new_folder(folder, marker=files.DECODED, force=force) as tmp:
+        return put_decoded(tmp, views, **how)
+
+
+def lost(reasons: U16) -> dict[str, int]:
+    """Pixels per reason, by its label; a pixel may count under several."""
+    return {r.label: n for r in Reason if (n := int(np.count_nonzero(reasons & np.uint16(r.value))))}
+
+
+# ----------------------------------------------------------------------------------------------------------- pictures
+
+
+def picture(a: F32, *, grey: bool = False) -> U8:
+    """(H, W) to RGB, 1st to 99th percentile; NaN is dark red in grey pictures, black in coloured ones."""
+    ok = np.isfinite(a)
+    low, high = (np.percentile(a[ok], (1, 99)) if ok.any() else (0.0, 1.0))
+    x = np.clip((np.where(ok, a, low) - low) / max(float(high - low), 1e-9), 0, 1)
+    x8 = np.asarray(np.rint(255 * x), np.uint8)
+    rgb: U8 = np.repeat(x8[..., None], 3, axis=2) if grey else _colours(x8, cv2.COLORMAP_VIRIDIS)
+    rgb[~ok] = (60, 0, 0) if grey else 0
+    return rgb
+
+
+def phase_picture(phase: F32) -> U8:
+    """Absolute phase (H, W) to RGB: the hue turns once per fringe, brightness grows with the phase; NaN is black."""
+    ok = np.isfinite(phase)
+    if not ok.any():
+        return np.zeros((*phase.shape, 3), np.uint8)
+    p = np.where(ok, phase, 0.0)
+    low, high = float(p[ok].min()), float(p[ok].max())
+    hue = np.asarray(np.mod(p / (2 * np.pi), 1) * 255, np.uint8)
+    rgb = _colours(hue, cv2.COLORMAP_TWILIGHT)
+    ramp = 0.35 + 0.65 * (p - low) / max(high - low, 1e-9)
+    out: U8 = np.asarray(rgb * np.where(ok, ramp, 0.0)[..., None], np.uint8)
+    return out
+
+
+_REASON_RGB: Sequence[tuple[int, int, int]] = (
+    (40, 40, 60), (255, 255, 0), (90, 60, 120), (230, 80, 30), (0, 200, 230), (220, 0, 160),
+    (0, 120, 255), (140, 90, 40), (255, 0, 0), (120, 255, 80), (255, 170, 200),
+)
+
+
+def reasons_picture(reasons: U16) -> U8:
+    """Reason bits (H, W) to RGB: valid pixels light grey, others in the colour of their lowest bit."""
+    out = np.full((*reasons.shape, 3), 225, np.uint8)
+    for r, rgb in reversed(list(zip(Reason, _REASON_RGB, strict=True))):
+        out[(reasons & np.uint16(r.value)) != 0] = rgb
+    return out
+
+
+def _colours(x: U8, table: int) -> U8:
+    bgr = cv2.applyColorMap(x, table)
+    out: U8 = np.ascontiguousarray(bgr[..., ::-1])
+    return out
