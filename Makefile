@@ -1,0 +1,55 @@
+# One word per task; `make` alone lists them. Each sets up what it needs the first time and is quick after that.
+# Another Python: make PYTHON=python3.12 test. Another environment: make VENV=/tmp/venv test.
+
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+WORKERS ?= 2
+READY := $(VENV)/.ready
+VALIDATOR := build/gltf_validator/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench docs verify reference lock clean
+
+help: ## this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
+
+$(READY): constraints/dev.txt pyproject.toml tools/make_venv.sh
+	@tools/make_venv.sh "$(PYTHON)" "$(VENV)"
+	@touch $@
+
+$(VALIDATOR): tools/gltf_validator/package.json tools/gltf_validator/validate.mjs
+	@tools/gltf_validator/install.sh
+
+setup: $(READY) $(VALIDATOR) ## the environment alone
+
+demo: $(READY) ## scan a wet specimen on the simulated instrument and show the result
+	$(BIN)/python tools/show_demo.py build/demo
+
+test: $(READY) $(VALIDATOR) ## the tests
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile
+
+check: $(READY) ## lint and types; what CI runs before the tests
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(READY) ## time the stages against a plain copy of the same memory, all in one run
+	$(BIN)/python benchmarks/stages.py --out build/bench.json
+
+docs: $(READY) ## the documentation as a static site in build/docs
+	$(BIN)/python tools/make_reference.py
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
+	@echo "build/docs/index.html"
+
+verify: $(READY) $(VALIDATOR) ## the long statistical tests; goes on where it stopped, writes docs/evidence/
+	$(BIN)/python tools/verify.py
+
+reference: $(READY) ## write docs/reference/ anew from the code
+	$(BIN)/python tools/make_reference.py
+
+lock: ## resolve constraints/ anew (needs uv from the package registry)
+	tools/lock.sh "$(PYTHON)"
+
+clean: ## remove what the targets made, the environment too
+	rm -rf build "$(VENV)" .mypy_cache .ruff_cache .pytest_cache
