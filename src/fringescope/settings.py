@@ -50,7 +50,7 @@ class PhaseSettings(_Section):
     order_majority: float = knob(0.7, "", "share of the votes that repairs an order", "II-C", 0.5, 1)
     max_sigma_rad: float = knob(0.5, "rad", "pixels whose phase is noisier than this do not vote on orders", "II-C", 0)
     max_misfit: float = knob(6.0, "sigma", "N-step samples that miss the fitted sinusoid by more than this are inconsistent frames", "", 0)
-    max_saturated: int = knob(0, "samples", "saturated samples of the finest set that a pixel may have", "III-D", 0)
+    max_saturated: float = knob(0.5, "", "share of a set's samples that may be saturated; they stay out of the fit", "III-D", 0, 1)
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,33 @@ class DenoiseSettings(_Section):
 class FuseSettings(_Section):
     """Three grids to one coloured cloud (III-C end, Fig. 12)."""
 
+    normal_radius: int = knob(2, "pixels", "half side of the window whose points give a normal", "", 1, 15)
+    max_slope: float = knob(4.0, "", "neighbours whose range differs by more than this share of their sideways distance lie across a jump", "", 0)
+    jump_sigma: float = knob(5.0, "sigma", "noise that is no jump", "", 0)
+    agree_sigma: float = knob(5.0, "sigma", "views whose surfaces differ by more than this, plus agree_mm, do not see the same place", "III-C", 0)
+    agree_mm: float = knob(0.05, "mm", "what the calibration may make views differ by", "III-C", 0)
+    blend_mm: float = knob(3.0, "mm", "width over which a view's weight rises from its border", "Fig. 12", 0)
+    hole_mm: float = knob(0.6, "mm", "holes narrower than this are no border", "Fig. 12", 0)
+    separation_mm: float = knob(0.05, "mm", "least sideways distance of points of different views, or half the sampling where that is more", "Fig. 12", 0)
+    gloss: float = knob(0.25, "", "a view brighter than the others by this share of their light sees a highlight and gets half its weight", "Fig. 12", 0.01)
+    highlight_pixels: int = knob(4, "pixels", "width over which the weight of a picture rises from its saturated pixels", "Fig. 12", 1, 100)
+    harmonise: bool = knob(True, "", "balance the pictures of different views by what they see in common", "Fig. 12")
+    white_red: float = knob(1.0, "", "factor on red under the ring light (green = 1), from a picture of something white", "Fig. 12", 0.05, 20)
+    white_blue: float = knob(1.0, "", "factor on blue under the ring light (green = 1)", "Fig. 12", 0.05, 20)
+
 
 @dataclass(frozen=True)
 class MeshSettings(_Section):
     """The cloud to a textured mesh with levels of detail."""
+
+    triangles: int = knob(200_000, "", "triangles of surface.glb at most", "", 100)
+    preview_triangles: int = knob(50_000, "", "triangles of the small level that shows first", "", 100)
+    max_points: int = knob(400_000, "", "points that are triangulated at most; denser clouds are strided", "", 1000)
+    max_edge: float = knob(3.5, "spacings", "longer edges bridge a hole or a shadow and go", "", 1.5)
+    jump_slope: float = knob(0.6, "", "an edge that leaves both its ends' tangent planes by more than this share of its length, plus jump_sigma, is a jump", "", 0)
+    jump_sigma: float = knob(5.0, "sigma", "noise that is no jump", "", 0)
+    max_error_mm: float = knob(0.03, "mm", "how far the simplified surface may leave the points; more triangles stay where it would", "", 0)
+    min_area_mm2: float = knob(0.5, "mm^2", "smaller pieces of surface are crumbs and go", "", 0)
 
 
 @dataclass(frozen=True)
