@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -60,6 +60,29 @@ def full_scale(pixel_format: PixelFormat) -> int:
     return pixel_format.max_value * (3 if pixel_format is PixelFormat.RGB8 else 1)
 
 
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One N-step set, fitted, before the noise is known. Arrays (H, W); `variance` is NaN where no sample is left over.
+
+    `poor` lists the pixels that kept two samples only, as flat indices with their sums of I cos and I sin: no sinusoid
+    of its own fits there, but one with the background of a finer set does (see `_rescue`).
+    """
+
+    fringe_set: FringeSet
+    phase: F32
+    background: F32
+    modulation: F32
+    variance: F32
+    clipped: AnyArray  #: uint64, bit n = sample n was saturated
+    poor: tuple[AnyArray, AnyArray, AnyArray]
+    lent: AnyArray | None = None  #: true where the background is another set's
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return self.fringe_set.steps
+
+
 class FringeSums:
     """Accumulator of one N-step set: `add` its frames in any order, then `finish`. Holds sums, never frames."""
 
@@ -68,7 +91,7 @@ class FringeSums:
         self.max_value = max_value
         self._seen: set[int] = set()
         self._sums: list[F32 | F64] = []
-        self._saturated = np.zeros((0, 0), np.uint8)
+        self._clipped = np.zeros((0, 0), np.uint64)
 
     def add(self, n: int, frame: AnyArray) -> None:
         """Add frame n, (H, W) unsigned integers. Raises CaptureError for a second frame n or another size."""
@@ -78,14 +101,14 @@ class FringeSums:
         if not self._sums:
             kind = np.float32 if self.max_value < 1024 else np.float64
             self._sums = [np.zeros(frame.shape, kind) for _ in range(4)]
-            self._saturated = np.zeros(frame.shape, np.uint8)
-        if frame.shape != self._saturated.shape:
+            self._clipped = np.zeros(frame.shape, np.uint64)
+        if frame.shape != self._clipped.shape:
             raise CaptureError(
                 f"frame {n} is {frame.shape[1]} x {frame.shape[0]} pixels; the set began with "
-                f"{self._saturated.shape[1]} x {self._saturated.shape[0]}"
+                f"{self._clipped.shape[1]} x {self._clipped.shape[0]}"
             )
         delta = 2 * math.pi * n / N
-        k.accumulate(frame, math.cos(delta), math.sin(delta), self.max_value, *self._sums, self._saturated)
+        k.accumulate(frame, n, math.cos(delta), math.sin(delta), self.max_value, *self._sums, self._clipped)
         self._seen.add(n)
 
     @property
@@ -93,8 +116,8 @@ class FringeSums:
         """Whether every frame has come."""
         return len(self._seen) == self.fringe_set.steps
 
-    def finish(self) -> tuple[WrappedSet, F32]:
-        """The wrapped set, its `sigma` not yet filled (NaN), and the sample variance (H, W) about the sinusoid.
+    def finish(self) -> Measured:
+        """The least-squares sinusoid of each pixel's unsaturated samples.
 
         Raises CaptureError if frames are missing.
         """
@@ -102,13 +125,52 @@ class FringeSums:
         missing = sorted(set(range(N)) - self._seen)
         if missing:
             raise CaptureError(f"a {N}-step set got {len(self._seen)} frames; missing {missing}")
-        shape = self._saturated.shape
+        shape = self._clipped.shape
         phase, background, modulation, variance = (np.empty(shape, np.float32) for _ in range(4))
-        k.wrap(*self._sums, N, phase, background, modulation, variance)
+        k.wrap(*self._sums, self._clipped, N, phase, background, modulation, variance)
+        index = np.flatnonzero(_left(self._clipped, N) == 2) if (self._clipped != 0).any() else np.zeros(0, np.intp)
+        poor = (index, self._sums[1].ravel()[index], self._sums[2].ravel()[index])
         self._sums = []
-        nan = np.full(shape, np.nan, np.float32)
-        g = (float(self.fringe_set.cycles_per_pixel[0]), float(self.fringe_set.cycles_per_pixel[1]))
-        return WrappedSet(g, N, phase, background, modulation, nan, self._saturated, nan), variance
+        return Measured(self.fringe_set, phase, background, modulation, variance, self._clipped, poor)
+
+
+def _left(clipped: AnyArray, steps: int) -> AnyArray:
+    """Samples of each pixel that are not saturated."""
+    return np.asarray(steps - np.bitwise_count(clipped).astype(np.int64))
+
+
+def _rescue(measured: Sequence[Measured]) -> list[Measured]:
+    """Two samples and the background of the set that has most samples left make a phase, good enough to tell the order."""
+    out = []
+    for m in measured:
+        index, p, q = m.poor
+        if len(index) == 0 or len(measured) == 1:
+            out.append(m)
+            continue
+        left = np.stack([_left(o.clipped.ravel()[index], o.steps) for o in measured])
+        exposure = [o.fringe_set.exposure_us == m.fringe_set.exposure_us for o in measured]
+        left[~np.array(exposure)] = 0
+        donor = left.argmax(0)
+        A = np.choose(donor, [o.background.ravel()[index] for o in measured]).astype(np.float64)
+        good = left.max(0) > 3
+        n = np.arange(m.steps)
+        there = ((m.clipped.ravel()[index][:, None] >> n.astype(np.uint64)) & np.uint64(1)) == 0
+        cos, sin = np.cos(2 * np.pi * n / m.steps), np.sin(2 * np.pi * n / m.steps)
+        m11, m12, m22 = there @ (cos * cos), there @ (cos * sin), there @ (sin * sin)
+        p, q = p - A * (there @ cos), q - A * (there @ sin)
+        det = m11 * m22 - m12 * m12
+        good &= det > 1e-9
+        index, A, det = index[good], A[good], det[good]
+        c = (m22[good] * p[good] - m12[good] * q[good]) / det
+        s = (m11[good] * q[good] - m12[good] * p[good]) / det
+        phase, background, modulation = m.phase.copy(), m.background.copy(), m.modulation.copy()
+        phase.ravel()[index] = np.arctan2(s, c)
+        background.ravel()[index] = A
+        modulation.ravel()[index] = np.hypot(c, s)
+        lent = np.zeros(m.phase.shape, bool)
+        lent.ravel()[index] = True
+        out.append(replace(m, phase=phase, background=background, modulation=modulation, lent=lent))
+    return out
 
 
 class GrayBits:
@@ -155,7 +217,7 @@ class GrayBits:
 # ------------------------------------------------------------------------------------------------------- the noise
 
 
-def estimate_noise(measured: Sequence[tuple[WrappedSet, F32]], max_value: int) -> NoiseModel:
+def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
     """Sensor noise `variance = a + b I` from the capture itself: the residuals about the sinusoids of sets with N > 3.
 
     In bins of the background the median residual (a chi-squared of N - 3 degrees of freedom) stands for the variance;
@@ -165,32 +227,30 @@ def estimate_noise(measured: Sequence[tuple[WrappedSet, F32]], max_value: int) -
     levels: list[float] = []
     variances: list[float] = []
     weights: list[float] = []
-    residual_sets = [(w, v) for w, v in measured if w.steps > 3]
-    samples: list[tuple[AnyArray, AnyArray, float, int]] = []
-    for w, v in residual_sets:
-        dof = w.steps - 3
-        samples.append((w.background, v, _chi2_median(dof), dof))
+    samples: list[tuple[AnyArray, AnyArray, int]] = []
+    for m in measured:
+        if m.steps > 3:
+            ok = m.clipped == 0
+            samples.append((m.background[ok], m.variance[ok], m.steps - 3))
     if not samples:
-        for (w1, _), (w2, _) in pairwise(measured):
-            if w1.background.shape == w2.background.shape:
-                d = (w1.background - w2.background).astype(np.float64)
-                d -= np.median(d)
-                samples.append((w1.background, d * d / (1 / w1.steps + 1 / w2.steps), _chi2_median(1), 1))
-    for A, v, median_factor, dof in samples:
-        ok = (0.01 * max_value < A) & (0.9 * max_value > A)
-        for w, _ in residual_sets:
-            if w.saturated.shape == ok.shape:
-                ok &= w.saturated == 0
-        if ok.sum() < 400:
+        for m1, m2 in pairwise(measured):
+            if m1.phase.shape == m2.phase.shape and m1.fringe_set.exposure_us == m2.fringe_set.exposure_us:
+                ok = (m1.clipped == 0) & (m2.clipped == 0)
+                A, d = m1.background[ok], (m1.background[ok] - m2.background[ok]).astype(np.float64)
+                d -= np.median(d) if d.size else 0.0
+                samples.append((A, d * d / (1 / m1.steps + 1 / m2.steps), 1))
+    for A, v, dof in samples:
+        ok = (A > 0.01 * max_value) & (A < 0.9 * max_value)
+        if np.count_nonzero(ok) < 400:
             continue
         a, x = A[ok], v[ok]
         edges = np.unique(np.quantile(a, np.linspace(0, 1, 25)))
-        where = np.clip(np.searchsorted(edges, a, side="right") - 1, 0, len(edges) - 2)
+        where = np.clip(np.searchsorted(edges, a, side="right") - 1, 0, max(len(edges) - 2, 0))
         for b in range(len(edges) - 1):
             inside = where == b
             if inside.sum() >= 50:
                 levels.append(float(a[inside].mean()))
-                variances.append(float(np.median(x[inside])) / median_factor)
+                variances.append(float(np.median(x[inside])) / _chi2_median(dof))
                 weights.append(float(inside.sum()) * dof)
     floor = 1.0 / 12.0
     if len(levels) < 3:
@@ -229,75 +289,79 @@ def measure(
     top = full_scale(plan.pixel_format)
     sums: dict[int, FringeSums] = {}
     bits: dict[int, GrayBits] = {}
-    done: dict[int, tuple[WrappedSet, F32]] = {}
+    done: dict[int, Measured] = {}
     for key, frame in frames:
         one = plan.sets[key.set_index]
         if isinstance(one, FringeSet):
             acc = sums.setdefault(key.set_index, FringeSums(one, top))
             acc.add(key.number, intensity(frame, plan.pixel_format))
             if acc.complete:
-                done[key.set_index] = sums.pop(key.set_index).finish()
+                done[key.set_index] = acc.finish()
         else:
             bits.setdefault(key.set_index, GrayBits(one)).add(
                 key.role, key.number, intensity(frame, plan.pixel_format)
             )
-    for acc in sums.values():
-        acc.finish()  # raises: frames are missing
-    absent = [i for i in range(len(plan.sets)) if i not in done and i not in bits]
-    if absent:
-        raise CaptureError(f"view '{plan.camera}': no frames came for set {absent[0]} of {len(plan.sets)}")
-    measured = [done[i] for i in sorted(done)]
-    shapes = {w.phase.shape for w, _ in measured}
+    for i, one in enumerate(plan.sets):
+        if i not in done and i not in bits:
+            if i in sums:
+                sums[i].finish()  # raises and names the missing frames
+            raise CaptureError(f"view '{plan.camera}': no frames came for set {i + 1} of {len(plan.sets)} ({one})")
+    measured = _rescue([done[i] for i in sorted(done)])
+    shapes = {m.phase.shape for m in measured}
     if len(shapes) > 1:
         sizes = ", ".join(f"{c} x {r}" for r, c in sorted(shapes))
         raise CaptureError(f"view '{plan.camera}': sets of different sizes: {sizes}; needed one size")
     noise = noise or estimate_noise(measured, top)
     gray = tuple(bits[i].finish(noise) for i in sorted(bits))
-    sets = _merge([_with_sigma(w, v, noise) for w, v in measured], plan, sorted(done), s)
+    sets = _merge([(m, _with_sigma(m, noise, s)) for m in measured])
     if sets:
         finest = min(sets, key=lambda w: float(np.median(w.sigma)) / math.hypot(*w.g))
         background, modulation = finest.background, finest.modulation
         reasons = np.zeros(background.shape, np.uint16)
         for w in sets:
-            if w.steps > 3:
-                reasons[w.misfit > s.max_misfit] |= np.uint16(Reason.INCONSISTENT)
+            reasons[w.misfit > s.max_misfit] |= np.uint16(Reason.INCONSISTENT)
     else:
         background = modulation = gray[0].contrast
         reasons = np.zeros(background.shape, np.uint16)
     return Decoded(plan.camera, (), tuple(sets), gray, background, modulation, reasons, noise)
 
 
-def _with_sigma(w: WrappedSet, variance: F32, noise: NoiseModel) -> WrappedSet:
-    sigma = np.empty_like(w.phase)
-    k.phase_sigma(w.phase, w.background, w.modulation, w.steps, noise.a, noise.b, sigma)
-    with np.errstate(invalid="ignore"):
-        misfit = np.sqrt(variance / (noise.a + noise.b * np.maximum(w.background, 0))).astype(np.float32)
-    return replace(w, sigma=sigma, misfit=misfit)
+def _with_sigma(m: Measured, noise: NoiseModel, s: PhaseSettings) -> WrappedSet:
+    sigma, lost = np.empty_like(m.phase), np.empty(m.phase.shape, np.uint8)
+    allowed = int(s.max_saturated * m.steps)
+    k.phase_sigma(
+        m.phase, m.background, m.modulation, m.clipped, m.steps, noise.a, noise.b, allowed, sigma, lost
+    )
+    if m.lent is not None:  # two samples fix cos and sin; the lent background adds its own share: twice the plain formula
+        v = noise.a + noise.b * m.background[m.lent]
+        sigma[m.lent] = np.sqrt(2 * v) / np.maximum(m.modulation[m.lent], 1e-6)
+    misfit = np.sqrt(m.variance / (noise.a + noise.b * np.maximum(m.background, 0))).astype(np.float32)
+    gx, gy = m.fringe_set.cycles_per_pixel
+    return WrappedSet(
+        (float(gx), float(gy)), m.steps, m.phase, m.background, m.modulation, sigma, lost, misfit
+    )
 
 
-def _merge(sets: list[WrappedSet], plan: ViewPlan, index: Sequence[int], s: PhaseSettings) -> list[WrappedSet]:
+def _merge(measured: Sequence[tuple[Measured, WrappedSet]]) -> list[WrappedSet]:
     """HDR: sets of equal g and different exposure become one, per pixel by sigma."""
-    groups: dict[tuple[float, float, int], list[WrappedSet]] = {}
-    for w, i in zip(sets, index, strict=True):
-        one = plan.sets[i]
-        bracket = isinstance(one, FringeSet) and one.exposure_us is not None
-        groups.setdefault((*w.g, -1 if bracket else i), []).append(w)
+    groups: dict[tuple[float, ...], list[WrappedSet]] = {}
+    for i, (m, w) in enumerate(measured):
+        alone = m.fringe_set.exposure_us is None
+        groups.setdefault((*w.g, float(i) if alone else -1.0), []).append(w)
     out = []
     for group in groups.values():
         if len(group) == 1:
             out.append(group[0])
             continue
-        merged = np.empty((5, *group[0].phase.shape), np.float32)
+        first = group[0]
+        merged = np.empty((5, *first.phase.shape), np.float32)
         stack = [np.stack([getattr(w, name) for w in group]) for name in ("phase", "background", "modulation", "sigma")]
-        k.merge_brackets(*stack, np.stack([w.saturated for w in group]), s.max_saturated, merged)
-        phase, background, modulation, sigma, saturated = merged
-        misfit = np.where(saturated > 0, np.nan, np.fmin.reduce([w.misfit for w in group]))
-        out.append(
-            WrappedSet(
-                group[0].g, group[0].steps, phase, background, modulation, sigma, saturated.astype(np.uint8),
-                misfit.astype(np.float32),
-            )
-        )
+        k.merge_brackets(*stack, merged)
+        phase, background, modulation, sigma, best = merged
+        pick = best.astype(np.intp)[None]
+        saturated = np.take_along_axis(np.stack([w.saturated for w in group]), pick, 0)[0]
+        misfit = np.take_along_axis(np.stack([w.misfit for w in group]), pick, 0)[0]
+        out.append(WrappedSet(first.g, first.steps, phase, background, modulation, sigma, saturated, misfit))
     return out
 
 
@@ -393,9 +457,9 @@ def _unwrap(
     sigmas = np.stack([np.hypot(w.sigma, np.float32(s.systematic_rad)) for w in group])
     freq = np.array([math.hypot(*w.g) for w in group])
     shape = phases.shape[1:]
-    absolute, margin, residual = (np.empty(shape, np.float32) for _ in range(3))
+    absolute, margin = np.empty(shape, np.float32), np.empty(shape, np.float32)
     none = np.zeros((0, 0), np.float32)
-    k.unwrap(phases, sigmas, freq, low, high, none if gray is None else gray, half, soft, absolute, margin, residual)
+    k.unwrap(phases, sigmas, freq, low, high, none if gray is None else gray, half, soft, absolute, margin)
     uncertain = ~(margin >= s.order_min_margin)
     if s.order_votes > 1:
         trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)

@@ -268,8 +268,8 @@ class FringeSet:
     exposure_us: float | None = None
 
     def __post_init__(self) -> None:
-        if self.steps < 3:
-            raise CaptureError(f"a fringe set with {self.steps} steps; phase shifting needs at least 3")
+        if not 3 <= self.steps <= 64:
+            raise CaptureError(f"a fringe set with {self.steps} steps; phase shifting needs 3 to 64")
         gx, gy = self.cycles_per_pixel
         if not (math.isfinite(gx) and math.isfinite(gy)) or math.hypot(gx, gy) == 0:
             raise CaptureError(f"cycles_per_pixel {self.cycles_per_pixel}; needed two finite numbers, not both zero")

@@ -12,111 +12,174 @@ TWO_PI = 2.0 * math.pi
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def accumulate(frame, cos_n, sin_n, max_value, total, in_phase, quadrature, squares, saturated):
-    """Add one frame (H, W) to the sums of its set: sum I, sum I cos, sum I sin, sum I^2, saturated samples."""
+def accumulate(frame, n, cos_n, sin_n, max_value, total, in_phase, quadrature, squares, clipped):
+    """Add frame n (H, W) to the sums of its set: sum I, sum I cos, sum I sin, sum I^2.
+
+    Saturated samples say nothing but "at least this much": they stay out of the sums and set bit n of `clipped`.
+    """
+    bit = np.uint64(1) << np.uint64(n)
     for i in prange(frame.shape[0]):
         for j in range(frame.shape[1]):
             raw = frame[i, j]
-            x = float(raw)
-            total[i, j] += x
-            in_phase[i, j] += x * cos_n
-            quadrature[i, j] += x * sin_n
-            squares[i, j] += x * x
             if raw >= max_value:
-                saturated[i, j] += 1
+                clipped[i, j] |= bit
+            else:
+                x = float(raw)
+                total[i, j] += x
+                in_phase[i, j] += x * cos_n
+                quadrature[i, j] += x * sin_n
+                squares[i, j] += x * x
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def normal_matrix(clipped, steps):
+    """Sums over the samples that are left of 1, cos, sin, cos^2, cos sin, sin^2, as a tuple with 1 first."""
+    m00 = m01 = m02 = m11 = m12 = m22 = 0.0
+    for n in range(steps):
+        if (clipped >> np.uint64(n)) & np.uint64(1):
+            continue
+        c = math.cos(TWO_PI * n / steps)
+        s = math.sin(TWO_PI * n / steps)
+        m00 += 1.0
+        m01 += c
+        m02 += s
+        m11 += c * c
+        m12 += c * s
+        m22 += s * s
+    return m00, m01, m02, m11, m12, m22
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def wrap(total, in_phase, quadrature, squares, steps, phase, background, modulation, variance):
-    """Sums to wrapped phase in (-pi, pi], A, B and the sample variance about the fitted sinusoid (NaN for 3 steps)."""
+def wrap(total, in_phase, quadrature, squares, clipped, steps, phase, background, modulation, variance):
+    """Sums to the least-squares sinusoid of the samples that are left: wrapped phase in (-pi, pi], A and B.
+
+    `variance` is that of the samples about the sinusoid, NaN where none is left over (three samples). Pixels with fewer
+    than three samples get phase 0, modulation 0 and the background of what there is.
+    """
     for i in prange(total.shape[0]):
         for j in range(total.shape[1]):
-            c = 2.0 * in_phase[i, j] / steps
-            s = 2.0 * quadrature[i, j] / steps
-            a = total[i, j] / steps
+            t, p, q = total[i, j], in_phase[i, j], quadrature[i, j]
+            left = float(steps)
+            if clipped[i, j] == np.uint64(0):
+                a = t / steps
+                c = 2.0 * p / steps
+                s = 2.0 * q / steps
+            else:
+                m00, m01, m02, m11, m12, m22 = normal_matrix(clipped[i, j], steps)
+                left = m00
+                c00 = m11 * m22 - m12 * m12
+                c01 = m02 * m12 - m01 * m22
+                c02 = m01 * m12 - m02 * m11
+                det = m00 * c00 + m01 * c01 + m02 * c02
+                if left < 3.0 or det < 1e-9:
+                    phase[i, j] = 0.0
+                    background[i, j] = t / left if left > 0.0 else np.inf
+                    modulation[i, j] = 0.0
+                    variance[i, j] = np.nan
+                    continue
+                c11 = m00 * m22 - m02 * m02
+                c12 = m01 * m02 - m00 * m12
+                c22 = m00 * m11 - m01 * m01
+                a = (c00 * t + c01 * p + c02 * q) / det
+                c = (c01 * t + c11 * p + c12 * q) / det
+                s = (c02 * t + c12 * p + c22 * q) / det
             phase[i, j] = math.atan2(s, c)
             background[i, j] = a
             modulation[i, j] = math.sqrt(c * c + s * s)
-            if steps > 3:
-                rest = squares[i, j] - steps * (a * a + 0.5 * (c * c + s * s))
-                variance[i, j] = max(rest, 0.0) / (steps - 3)
+            if left > 3.0:
+                variance[i, j] = max(squares[i, j] - a * t - c * p - s * q, 0.0) / (left - 3.0)
             else:
                 variance[i, j] = np.nan
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def phase_sigma(phase, background, modulation, steps, a, b, out):
-    """Standard deviation of the wrapped phase for sample variance a + b I: sqrt(2 (a + b A) / N) / B.
+def phase_sigma(phase, background, modulation, clipped, steps, a, b, max_clipped, out, lost):
+    """Standard deviation of the wrapped phase for sample variance a + b I: sqrt(2 (a + b A) / N) / B for N > 3.
 
-    Exact for N > 3; three steps have a further term, -(b B / 2) cos 3 phi. Infinite where B is 0.
+    Three steps have a further term, -(b B / 2) cos 3 phi; with clipped samples the inverse normal matrix of the rest
+    takes the place of 2 / N. Infinite where B is 0 or more than `max_clipped` samples are clipped. `lost` counts them.
     """
     for i in prange(phase.shape[0]):
         for j in range(phase.shape[1]):
             B = modulation[i, j]
             v = a + b * background[i, j]
-            if steps == 3:
+            gain = 2.0 / steps
+            lost[i, j] = 0
+            if clipped[i, j] != np.uint64(0):
+                m00, m01, m02, m11, m12, m22 = normal_matrix(clipped[i, j], steps)
+                lost[i, j] = steps - int(m00)
+                det = m00 * (m11 * m22 - m12 * m12) + m01 * (m02 * m12 - m01 * m22) + m02 * (m01 * m12 - m02 * m11)
+                if lost[i, j] > max_clipped or det < 1e-9:
+                    out[i, j] = np.inf
+                    continue
+                jc = -math.sin(phase[i, j])
+                js = math.cos(phase[i, j])
+                c11 = m00 * m22 - m02 * m02
+                c12 = m01 * m02 - m00 * m12
+                c22 = m00 * m11 - m01 * m01
+                gain = (jc * jc * c11 + 2.0 * jc * js * c12 + js * js * c22) / det
+            elif steps == 3:
                 v -= 0.5 * b * B * math.cos(3.0 * phase[i, j])
-            out[i, j] = math.sqrt(2.0 * max(v, 0.0) / steps) / B if B > 0.0 else np.inf
+            out[i, j] = math.sqrt(gain * max(v, 0.0)) / B if B > 0.0 else np.inf
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def merge_brackets(phase, background, modulation, sigma, saturated, max_saturated, out):
-    """Merge HDR brackets (E, H, W) per pixel by inverse variance of the phase; saturated brackets only if all are.
+def merge_brackets(phase, background, modulation, sigma, out):
+    """Merge HDR brackets (E, H, W) per pixel by inverse variance of the phase; brackets of infinite sigma stay out.
 
-    `out` (5, H, W): phase, background, modulation, sigma of the merged measurement, saturated samples. Background and
-    modulation are those of the best bracket, so that they stay within the range of one exposure.
+    `out` (5, H, W): phase, background, modulation, sigma of the merged measurement, and the number of the best bracket,
+    whose background and modulation stand for all, so that they stay within the range of one exposure.
     """
-    E = phase.shape[0]
     for i in prange(phase.shape[1]):
         for j in range(phase.shape[2]):
-            best, best_sigma, fewest = -1, np.inf, 1 << 30
-            for e in range(E):
-                fewest = min(fewest, int(saturated[e, i, j]))
-            limit = max(fewest, max_saturated)
+            best = 0
             s = c = w_sum = 0.0
-            for e in range(E):
+            for e in range(phase.shape[0]):
                 sg = sigma[e, i, j]
-                if saturated[e, i, j] > limit or not (sg > 0.0 and sg < np.inf):
-                    continue
-                w = 1.0 / (sg * sg)
-                s += w * math.sin(phase[e, i, j])
-                c += w * math.cos(phase[e, i, j])
-                w_sum += w
-                if sg < best_sigma:
-                    best, best_sigma = e, sg
-            if best < 0:
-                best = 0
-                out[0, i, j] = phase[0, i, j]
-                out[3, i, j] = np.inf
-            else:
-                out[0, i, j] = math.atan2(s, c)
-                out[3, i, j] = 1.0 / math.sqrt(w_sum)
+                if sg > 0.0 and sg < np.inf:
+                    w = 1.0 / (sg * sg)
+                    s += w * math.sin(phase[e, i, j])
+                    c += w * math.cos(phase[e, i, j])
+                    w_sum += w
+                if sg < sigma[best, i, j]:
+                    best = e
+            out[0, i, j] = math.atan2(s, c)
             out[1, i, j] = background[best, i, j]
             out[2, i, j] = modulation[best, i, j]
-            out[4, i, j] = saturated[best, i, j]
+            out[3, i, j] = 1.0 / math.sqrt(w_sum) if w_sum > 0.0 else np.inf
+            out[4, i, j] = best
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _chain(phases, sigmas, freq, i, j, order):
-    """Follow the sets from coarse to fine from a first order: absolute phase of the finest, chi squared, worst step."""
-    absolute = phases[0, i, j] + TWO_PI * order
+def _chain(phases, sigmas, freq, i, j, first, order):
+    """Follow the sets from coarse to fine from an order of set `first`: absolute phase of the finest and chi squared.
+
+    Sets of infinite sigma are passed over. The third value is the margin of the closest rounding on the way: how many
+    standard deviations the next order of that set would fit worse.
+    """
+    absolute = phases[first, i, j] + TWO_PI * order
+    sigma = sigmas[first, i, j]
+    last = first
     chi2 = 0.0
-    worst = 0.0
-    for k in range(1, phases.shape[0]):
-        ratio = freq[k] / freq[k - 1]
+    margin2 = np.inf
+    for k in range(first + 1, phases.shape[0]):
+        if not sigmas[k, i, j] < np.inf:
+            continue
+        ratio = freq[k] / freq[last]
         predicted = absolute * ratio
         turns = math.floor((predicted - phases[k, i, j]) / TWO_PI + 0.5)
         rest = predicted - phases[k, i, j] - TWO_PI * turns
-        var = (sigmas[k - 1, i, j] * ratio) ** 2 + sigmas[k, i, j] ** 2
-        z2 = rest * rest / var
-        chi2 += z2
-        worst = max(worst, z2)
+        var = (sigma * ratio) ** 2 + sigmas[k, i, j] ** 2
+        chi2 += rest * rest / var
+        margin2 = min(margin2, TWO_PI * (TWO_PI - 2.0 * abs(rest)) / var)
         absolute = phases[k, i, j] + TWO_PI * turns
-    return absolute, chi2, worst
+        sigma = sigmas[k, i, j]
+        last = k
+    return absolute, chi2, margin2
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, margin, residual):
+def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, margin):
     """Absolute phase of the finest of K parallel sets (K, H, W), coarse to fine, by least chi squared (equation 5).
 
     Every order of the coarsest set is tried whose finest phase lies in [low, high] of its pixel (arrays (h, w) that are
@@ -125,13 +188,12 @@ def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, mar
     (0, 0)) holds the finest phase at the middle of its code cell: `gray_half` is half the cell, `gray_soft` the
     uncertainty of its edges, both in finest phase. NaN in `gray` = no opinion.
 
-    Writes the phase (NaN if no order fits into the bounds), `margin` = sqrt(chi2 of the second best - best), 99 if
-    there is no second, and `residual` = the largest misfit of a step in standard deviations.
+    Writes the phase (NaN if no order fits into the bounds) and `margin`: how many standard deviations the next best
+    order fits worse, be it another order of the coarsest set or the other way of rounding a finer one; at most 99.
     """
     H, W = phases.shape[1], phases.shape[2]
     h, w = low.shape
     K = phases.shape[0]
-    up = freq[K - 1] / freq[0]
     use_gray = gray.shape[0] == H
     for i in prange(H):
         y = i * (h - 1) / max(H - 1, 1)
@@ -151,18 +213,22 @@ def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, mar
             )
             best = np.nan
             best_chi2 = second_chi2 = np.inf
-            best_worst = 0.0
+            best_margin2 = np.inf
             middle = np.nan
             if use_gray:
                 middle = gray[i, j]
                 if middle == middle:
                     lo = max(lo, middle - 2.0 * gray_half)
                     hi = min(hi, middle + 2.0 * gray_half)
-            if lo <= hi and sigmas[K - 1, i, j] < np.inf and sigmas[0, i, j] < np.inf:
-                first = math.floor((lo / up - phases[0, i, j]) / TWO_PI)
-                last = math.ceil((hi / up - phases[0, i, j]) / TWO_PI)
+            coarsest = 0
+            while coarsest < K - 1 and not sigmas[coarsest, i, j] < np.inf:
+                coarsest += 1
+            if lo <= hi and sigmas[K - 1, i, j] < np.inf:
+                up = freq[K - 1] / freq[coarsest]
+                first = math.floor((lo / up - phases[coarsest, i, j]) / TWO_PI)
+                last = math.ceil((hi / up - phases[coarsest, i, j]) / TWO_PI)
                 for order in range(int(first), int(last) + 1):
-                    absolute, chi2, worst = _chain(phases, sigmas, freq, i, j, order)
+                    absolute, chi2, rounding2 = _chain(phases, sigmas, freq, i, j, coarsest, order)
                     if absolute < lo or absolute > hi:
                         continue
                     if middle == middle:
@@ -170,12 +236,11 @@ def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, mar
                         chi2 += off * off
                     if chi2 < best_chi2:
                         second_chi2 = best_chi2
-                        best, best_chi2, best_worst = absolute, chi2, worst
+                        best, best_chi2, best_margin2 = absolute, chi2, rounding2
                     elif chi2 < second_chi2:
                         second_chi2 = chi2
             out[i, j] = best
-            margin[i, j] = math.sqrt(second_chi2 - best_chi2) if second_chi2 < np.inf else 99.0
-            residual[i, j] = math.sqrt(best_worst)
+            margin[i, j] = min(math.sqrt(max(min(second_chi2 - best_chi2, best_margin2), 0.0)), 99.0)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
