@@ -1,8 +1,8 @@
 """Runs the long statistical tests (marker `verify`), goes on where it stopped, and writes a dated result.
 
-What passed is remembered per state of the sources in `build/verify/`, so that an interrupted run loses one
-test at most. When all have passed or failed, the result goes to `docs/evidence/DATE-verify.md`, with the figures that the tests
-recorded (`record_property`).
+What passed is remembered per state of the sources in `build/verify/`: an interrupted run loses one test at most. When
+all have run, the result goes to `docs/evidence/DATE-verify.md`, with the figures that the tests recorded
+(`record_property`).
 
     python tools/verify.py [pytest arguments]
 """

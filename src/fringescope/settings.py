@@ -21,6 +21,13 @@ def knob(default: Any, unit: str, doc: str, paper: str = "", low: float | None =
     return field(default=default, metadata={"unit": unit, "doc": doc, "paper": paper, "low": low, "high": high})
 
 
+def _same_kind(value: Any, default: Any) -> bool:
+    """Whether a value may stand where `default` stands: a whole number also where a fraction may, nothing else mixed."""
+    if isinstance(default, float):
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return type(value) is type(default)
+
+
 class _Section:
     """Checks ranges and types of a section's fields when it is made."""
 
@@ -29,9 +36,7 @@ class _Section:
             value, meta = getattr(self, f.name), f.metadata
             if "unit" not in meta:
                 continue
-            if isinstance(f.default, bool) != isinstance(value, bool) or (
-                not isinstance(f.default, (bool, str)) and not isinstance(value, (int, float))
-            ) or (isinstance(f.default, str) and not isinstance(value, str)):
+            if not _same_kind(value, f.default):
                 raise UsageError(f"setting {f.name}: {value!r}; needed a {type(f.default).__name__}")
             if isinstance(value, (int, float)) and not isinstance(value, bool):
                 low, high = meta["low"], meta["high"]
