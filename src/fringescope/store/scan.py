@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-import fringescope
+from fringescope import __version__
 from fringescope.errors import FormatError
 from fringescope.store import files
 from fringescope.store.images import Images, write_png, write_tiff
@@ -105,11 +105,11 @@ def put_scan(
     write_ply(folder / "cloud.ply", cloud)
     identity = {
         "capture": capture_hash, "rig": rig_hash, "settings": plain(settings),
-        "software": fringescope.__version__, "cloud": _sha256(folder / "cloud.ply"),
+        "software": __version__, "cloud": _sha256(folder / "cloud.ply"),
     }
     hash_ = files.canonical_hash(identity)
     if scan.surface is not None:
-        extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {fringescope.__version__}"}
+        extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
         write_glb(folder / "surface.glb", scan.surface, extras)
     for g in scan.grids:
         _put_grid(folder / g.camera, g, grids)
@@ -119,7 +119,7 @@ def put_scan(
         "format": FORMAT,
         "version": VERSION,
         "hash": hash_,
-        "software": {"name": "fringescope", "version": fringescope.__version__},
+        "software": {"name": "fringescope", "version": __version__},
         "created": _now(),
         "capture": capture_hash,
         "rig": rig_hash,
@@ -250,7 +250,7 @@ def put_decoded(
         })
     doc = {
         "format": DECODED_FORMAT, "version": DECODED_VERSION,
-        "software": {"name": "fringescope", "version": fringescope.__version__}, "created": _now(),
+        "software": {"name": "fringescope", "version": __version__}, "created": _now(),
         "capture": capture_hash, "views": entries, "settings": plain(settings), **plain(extra or {}),
     }
     files.write_json(folder / files.DECODED, doc)
