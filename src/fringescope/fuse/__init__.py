@@ -1,5 +1,6 @@
 """Grids and ring-light pictures to one coloured cloud and a textured surface (III-C end, Fig. 12)."""
 
+from fringescope.fuse.mesh import surface
 from fringescope.fuse.photo import decode_srgb, encode_srgb, photo, photo_from_background, white_gains
 from fringescope.fuse.points import Fused, all_points, cloud, merge, normals
 
@@ -13,5 +14,6 @@ __all__ = [
     "normals",
     "photo",
     "photo_from_background",
+    "surface",
     "white_gains",
 ]
