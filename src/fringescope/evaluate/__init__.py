@@ -1,0 +1,40 @@
+"""Form fits with robust statistics, repeatability and calibrated uncertainty (III-E, IV-A, IV-B).
+
+Everything takes arrays in world mm and returns frozen results; lengths in results carry their unit in the name
+(`_mm`, `_um`). A point farther than `band_mm` from the fitted form is a flying point: it is counted, and no other
+figure of the form contains it.
+"""
+
+from fringescope.evaluate.plane import PlaneFit, fit_plane, measure_plane
+from fringescope.evaluate.repeat import Repeatability, repeatability
+from fringescope.evaluate.sphere import SphereFit, fit_sphere, fit_spheres
+from fringescope.evaluate.statistics import (
+    BAND_MM,
+    Spread,
+    along_rays,
+    neighbour_correlation,
+    sigma_ratio,
+    spread,
+    tile_form,
+)
+from fringescope.evaluate.verdict import Evaluation, evaluate
+
+__all__ = [
+    "BAND_MM",
+    "Evaluation",
+    "PlaneFit",
+    "Repeatability",
+    "SphereFit",
+    "Spread",
+    "along_rays",
+    "evaluate",
+    "fit_plane",
+    "fit_sphere",
+    "fit_spheres",
+    "measure_plane",
+    "neighbour_correlation",
+    "repeatability",
+    "sigma_ratio",
+    "spread",
+    "tile_form",
+]
