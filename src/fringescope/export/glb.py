@@ -1,0 +1,125 @@
+"""Surfaces as GLB: plain core glTF 2.0, one primitive and one picture per textured part."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from fringescope.errors import OutputError
+from fringescope.export.ply import Target, opened
+from fringescope.types import U8, AnyArray, Surface
+
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+
+
+def encode_picture(rgb: U8, quality: int = 90) -> tuple[bytes, str]:
+    """An sRGB picture (h, w, 3) as JPEG bytes (PNG where `quality` is above 100), and its MIME type."""
+    suffix, options = (".png", []) if quality > 100 else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+    ok, data = cv2.imencode(suffix, np.ascontiguousarray(rgb[..., ::-1]), options)
+    if not ok:
+        raise OutputError(f"a texture of {rgb.shape[1]} x {rgb.shape[0]} could not be encoded; crop or scale it")
+    return data.tobytes(), "image/png" if quality > 100 else "image/jpeg"
+
+
+class _Buffer:
+    """The binary chunk as it grows, with its views and accessors."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, raw: bytes, target: int | None = None) -> int:
+        self.data += b"\0" * (-len(self.data) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw)}
+        self.views.append(view if target is None else view | {"target": target})
+        self.data += raw
+        return len(self.views) - 1
+
+    def accessor(self, values: AnyArray, kind: str, component: int, target: int, bounds: bool = False) -> int:
+        a = {"bufferView": self.view(values.tobytes(), target), "componentType": component, "count": len(values),
+             "type": kind}
+        if bounds:
+            a |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        self.accessors.append(a)
+        return len(self.accessors) - 1
+
+
+def glb_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, quality: int = 90, lit: bool = False) -> bytes:
+    """A surface as the bytes of a GLB file.
+
+    Vertices stay world mm, float32; one root node scales by 0.001 and turns z-up into glTF's y-up. `extras` (scan hash
+    and so on) go beside the units into `asset.extras`. Pictures are JPEG of `quality`, or PNG above 100. Materials are
+    unlit (KHR_materials_unlit, with the core material as what other viewers show), so that colours appear as the
+    cameras saw them; `lit` leaves the light to the viewer. Raises OutputError if a picture cannot be encoded.
+    """
+    b = _Buffer()
+    primitives, materials, textures, images = [], [], [], []
+    for i, part in enumerate(surface.parts):
+        if not len(part.faces):
+            continue
+        xyz = np.ascontiguousarray(surface.vertices[part.vertex_index], dtype="<f4")
+        normals = surface.normals[part.vertex_index].astype(np.float64)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        small = len(xyz) < 65535
+        indices = part.faces.astype("<u2" if small else "<u4").reshape(-1)
+        picture, mime = encode_picture(part.texture, quality)
+        primitives.append({
+            "attributes": {
+                "POSITION": b.accessor(xyz, "VEC3", _FLOAT, _ARRAY_BUFFER, bounds=True),
+                "NORMAL": b.accessor(normals.astype("<f4"), "VEC3", _FLOAT, _ARRAY_BUFFER),
+                "TEXCOORD_0": b.accessor(part.uv.astype("<f4"), "VEC2", _FLOAT, _ARRAY_BUFFER),
+            },
+            "indices": b.accessor(indices, "SCALAR", _UINT16 if small else _UINT32, _ELEMENT_BUFFER),
+            "material": len(materials),
+            "mode": 4,
+            "extras": {"view": part.view},
+        })
+        materials.append({
+            "name": f"view {part.view}",
+            "pbrMetallicRoughness": {"baseColorTexture": {"index": len(textures)}, "metallicFactor": 0.0,
+                                     "roughnessFactor": 0.9},
+            "doubleSided": True,
+        } | ({} if lit else {"extensions": {"KHR_materials_unlit": {}}}))
+        textures.append({"sampler": 0, "source": len(images)})
+        images.append({"name": f"picture {i}", "mimeType": mime, "bufferView": b.view(picture)})
+    if not primitives:
+        raise OutputError("a surface without triangles; GLB needs at least one")
+    b.data += b"\0" * (-len(b.data) % 4)
+    half = math.sqrt(0.5)
+    root: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "fringescope", "extras": {"units": "mm", "up": "z", **(extras or {})}},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "world_mm", "mesh": 0, "scale": [0.001] * 3, "rotation": [-half, 0.0, 0.0, half]}],
+        "meshes": [{"name": "surface", "primitives": primitives}],
+        "materials": materials,
+        "textures": textures,
+        "images": images,
+        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        "accessors": b.accessors,
+        "bufferViews": b.views,
+        "buffers": [{"byteLength": len(b.data)}],
+    }
+    if not lit:
+        root["extensionsUsed"] = ["KHR_materials_unlit"]
+    text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(b.data)
+    return (struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text
+            + struct.pack("<I4s", len(b.data), b"BIN\0") + bytes(b.data))
+
+
+def write_glb(surface: Surface, target: Target, extras: Mapping[str, Any] | None = None, quality: int = 90,
+              lit: bool = False) -> None:
+    """Write `glb_bytes` to a path or a binary file object."""
+    data = glb_bytes(surface, extras, quality, lit)
+    with opened(target) as f:
+        f.write(data)
