@@ -7,7 +7,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 READY := $(VENV)/.ready
-VALIDATOR := build/gltf_validator/.ready
+VALIDATOR := tests/glb_validator/node_modules/.ready
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check bench docs verify reference lock clean
@@ -19,8 +19,8 @@ $(READY): constraints/dev.txt pyproject.toml tools/make_venv.sh
 	@tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 	@touch $@
 
-$(VALIDATOR): tools/gltf_validator/package.json tools/gltf_validator/validate.mjs
-	@tools/gltf_validator/install.sh
+$(VALIDATOR): tests/glb_validator/package-lock.json tools/glb_validator.sh
+	@tools/glb_validator.sh
 
 setup: $(READY) $(VALIDATOR) ## the environment alone
 
@@ -52,4 +52,4 @@ lock: ## resolve constraints/ anew (needs uv from the package registry)
 	tools/lock.sh "$(PYTHON)"
 
 clean: ## remove what the targets made, the environment too
-	rm -rf build "$(VENV)" .mypy_cache .ruff_cache .pytest_cache
+	rm -rf build tests/glb_validator/node_modules "$(VENV)" .mypy_cache .ruff_cache .pytest_cache

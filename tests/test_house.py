@@ -41,7 +41,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "devices": (DATA, "a device knows what it is asked, not who asks"),
     "devices.simulated": (DATA | {"twin"}, "the twin posing as devices"),
     "devices.replay": (DATA | {"store"}, "a stored capture posing as devices"),
-    "capture": (DATA | {"devices.base", "kernels"}, "the one stage that meets a device; proves that frame n is pattern n"),
+    "capture": (DATA | {"devices.base", "kernels"}, "the one stage that meets a device"),
     "store": (DATA, "files know data, not algorithms"),
     "export": (DATA, "files know data, not algorithms"),
     "pipeline": (BOTTOM | STAGES | {"capture"}, "all ordering lives here: objects in, objects out; no files"),
@@ -57,6 +57,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 #: Packages that only some units may import, and which.
 CONFINED = {
+    "numba": {"kernels", "twin"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"report", "evaluate"},
