@@ -307,7 +307,7 @@ def a_scan() -> Scan:
 
 
 def write_a_scan(folder: Path, **more: Any) -> dict[str, Any]:
-    def ply(path: Path, cloud: Cloud) -> None:
+    def ply(cloud: Cloud, path: Path) -> None:
         path.write_bytes(b"ply" + cloud.xyz.tobytes())
 
     def glb(*_: Any) -> None:

@@ -26,8 +26,8 @@ from fringescope.types import F32, U8, U16, Cloud, Decoded, Grid, Reason, Scan, 
 FORMAT, VERSION = "fringescope-scan", 1
 DECODED_FORMAT, DECODED_VERSION = "fringescope-decoded", 1
 
-WritePly = Callable[[Path, Cloud], None]
-WriteGlb = Callable[[Path, Surface, Mapping[str, Any]], None]
+WritePly = Callable[[Cloud, Path], None]
+WriteGlb = Callable[[Surface, Path, Mapping[str, Any]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def put_scan(
     capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
     """
     cloud = scan.cloud if all_points is None else all_points
-    write_ply(folder / "cloud.ply", cloud)
+    write_ply(cloud, folder / "cloud.ply")
     identity = {
         "capture": capture_hash, "rig": rig_hash, "settings": plain(settings),
         "software": __version__, "cloud": _sha256(folder / "cloud.ply"),
@@ -110,7 +110,7 @@ def put_scan(
     hash_ = files.canonical_hash(identity)
     if scan.surface is not None:
         extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
-        write_glb(folder / "surface.glb", scan.surface, extras)
+        write_glb(scan.surface, folder / "surface.glb", extras)
     for g in scan.grids:
         _put_grid(folder / g.camera, g, grids)
     digests = {str(p.relative_to(folder).as_posix()): _sha256(p) for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -1,0 +1,106 @@
+"""Somebody's loose images to a capture, with a preview and a proof that the order is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fringescope import store
+from fringescope.errors import CaptureError, UsageError
+from fringescope.importing.loose import LOSSY, Gray, LooseFrames, Recipe, RecipeFrames, image_files, stack_pages
+from fringescope.importing.order import Evidence, look
+from fringescope.importing.preview import draw
+from fringescope.types import PixelFormat, ViewInput
+
+__all__ = ["Evidence", "Gray", "ImportedView", "LooseFrames", "Recipe", "draw", "find_views", "look", "put_import"]
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedView:
+    """One camera's loose images, ready to be weighed (`look(view.images, recipe)`) and written."""
+
+    camera: str
+    images: LooseFrames
+    notes: tuple[str, ...]
+    color: LooseFrames | None = None
+
+    def view_input(self, recipe: Recipe) -> ViewInput:
+        """As the pipeline takes it; frames are read when asked for."""
+        plan = recipe.plan(self.camera, self.images.fmt)
+        color = None if self.color is None else self.color[0]
+        return ViewInput(plan, RecipeFrames(self.images, recipe, plan), color)
+
+
+def find_views(
+    source: Path | str,
+    recipe: Recipe,
+    *,
+    camera: str = "camera1",
+    pattern: str = "*",
+    pixel_format: PixelFormat | None = None,
+    left_aligned: bool = False,
+    color: str | None = None,
+    axis: str | None = None,
+    time: int | None = None,
+) -> tuple[ImportedView, ...]:
+    """The views in a folder of images, in a folder of such folders (one per camera), or in a TIFF stack.
+
+    `color` is the ring-light picture's file name in the folder, apart from the frames. Raises CaptureError where the
+    images do not suffice or cannot be read, UsageError where the recipe or the options cannot mean anything.
+    """
+    source = Path(source)
+    shift = 0
+    if left_aligned:
+        if pixel_format is None or not 8 < pixel_format.bits < 16:
+            raise UsageError("--left-aligned needs --pixel-format with 10 or 12 bits, such as Mono12")
+        shift = 16 - pixel_format.bits
+    if source.is_file():
+        stack = stack_pages(source, recipe.files_needed, axis, time)
+        images = LooseFrames(source.parent, stack.names, left_aligned=shift, fmt=pixel_format)
+        return (ImportedView(camera, images, (stack.note, *_depth_note(images))),)
+    if not source.is_dir():
+        raise CaptureError(f"{source}: not found; needed a folder of images or a TIFF stack")
+    folders = {camera: source}
+    if not image_files(source, pattern):
+        folders = {p.name: p for p in sorted(source.iterdir()) if p.is_dir() and image_files(p, pattern)}
+    if not folders:
+        raise CaptureError(f"{source}: holds no images ({pattern}); needed PNG, TIFF, BMP or PGM files")
+    return tuple(_view(p, n, recipe, pattern, pixel_format, shift, color) for n, p in folders.items())
+
+
+def _view(
+    folder: Path, camera: str, recipe: Recipe, pattern: str, fmt: PixelFormat | None, shift: int, color: str | None
+) -> ImportedView:
+    names = [p.name for p in image_files(folder, pattern) if p.name != color]
+    if len(names) != recipe.files_needed:
+        raise CaptureError(
+            f"{folder}: {len(names)} images, --steps and --periods need {recipe.files_needed}: mend them, pick files "
+            "with --glob, name the ring-light picture with --color and Gray code with --gray"
+        )
+    images = LooseFrames(folder, names, left_aligned=shift, fmt=fmt)
+    notes = [f"{len(names)} images, {names[0]} to {names[-1]}", *_depth_note(images)]
+    if any(n.lower().endswith(LOSSY) for n in names):
+        notes.append("JPEG loses what phase needs: record PNG or TIFF")
+    picture = None if color is None else LooseFrames(folder, [color], left_aligned=shift, fmt=images.fmt)
+    return ImportedView(camera, images, tuple(notes), picture)
+
+
+def _depth_note(images: LooseFrames) -> tuple[str, ...]:
+    if images.fmt is not PixelFormat.MONO16:
+        return ()
+    top = max(int(images[i].max()) for i in range(len(images)))
+    for fmt in (PixelFormat.MONO10, PixelFormat.MONO12):
+        if top <= fmt.max_value:
+            return (f"taken as Mono16, but no value exceeds {top}: with --pixel-format {fmt.value} saturation is seen",)
+    return ()
+
+
+def put_import(folder: Path, views: tuple[ImportedView, ...], recipe: Recipe, evidence: Mapping[str, Evidence]) -> None:
+    """Writes the capture, and `import-<camera>.png` beside it, into a folder that is being made."""
+    w, h = recipe.projector
+    extra: dict[str, Any] = {"imported": {c: store.plain(e.figures()) for c, e in evidence.items()}}
+    store.put_capture(folder, w, h, recipe.layout, (v.view_input(recipe) for v in views), extra)
+    for camera, e in evidence.items():
+        draw(e, folder / f"import-{camera}.png", camera)
