@@ -43,6 +43,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "devices.replay": (DATA | {"store"}, "a stored capture posing as devices"),
     "capture": (DATA | {"devices.base", "kernels"}, "the one stage that meets a device"),
     "store": (DATA, "files know data, not algorithms"),
+    "importing": (DATA | {"store"}, "other people's images become one of our captures"),
     "export": (DATA, "files know data, not algorithms"),
     "pipeline": (BOTTOM | STAGES | {"capture"}, "all ordering lives here: objects in, objects out; no files"),
     "server": (ANYTHING, "the rim: nobody imports it"),
@@ -160,7 +161,7 @@ def test_exceptions_are_used() -> None:
 def test_a_file_is_a_room_for_one_family(path: Path) -> None:
     text = path.read_text()
     assert len(text.splitlines()) <= 500
-    assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", text)
+    assert not re.search(r"\b(TODO|FIXME|XXX|raise NotImplementedError)\b", text)
     tree = ast.parse(text)
     assert ast.get_docstring(tree) or not text.strip(), "a module says in its first line what it is for"
     for node in ast.walk(tree):
