@@ -64,6 +64,24 @@ class DenoiseSettings(_Section):
 
     min_background: float = knob(3.0, "8-bit codes", "pixels darker than this are dark", "III-D 1", 0)
     min_modulation: float = knob(3.0, "8-bit codes", "pixels modulated less than this have low modulation", "III-D 1", 0)
+    min_contrast: float = knob(0.05, "", "least modulation as a share of the background", "V-D", 0, 1)
+    min_modulation_sigma: float = knob(4.0, "sigma", "least modulation in standard deviations of a sample at that background", "V-D", 0)
+    max_sigma_factor: float = knob(2.5, "", "a phase noisier than this times the view's median is of no use", "V-D", 1)
+    min_fine_modulation: float = knob(0.75, "", "least modulation of the finest set over the next coarser one, relative to what is usual around: less means light that came by way of other places", "III-D 1", 0, 1)
+    monotonic_reach: float = knob(2.0, "pixels of 684", "distance over which the phase gradient is taken, at 684 pixels of image width", "III-D 2", 1)
+    monotonic_sigma: float = knob(3.0, "sigma", "a gradient has a sign if it exceeds this", "III-D 2", 0)
+    monotonic_window: int = knob(5, "pixels", "side of the window in which gradients vote", "III-D 2", 1, 31)
+    monotonic_share: float = knob(0.6, "", "share of backward votes that marks a reversal", "III-D 2", 0, 1)
+    jump_factor: float = knob(4.0, "", "T1: largest phase step between neighbours, in steps of a surface that faces both devices", "III-D 3", 0)
+    jump_floor_rad: float = knob(0.2, "rad", "T1 is at least this", "III-D 3", 0)
+    jump_sigma: float = knob(4.0, "sigma", "noise allowance added to T1", "III-D 3", 0)
+    jump_links: int = knob(4, "pixels", "a pixel that continues fewer of its eight neighbours stands on a jump", "III-D 3", 0, 8)
+    island_share: float = knob(0.0005, "", "T2: smallest domain, as a share of the image's pixels", "III-D 3", 0, 1)
+    local_window: int = knob(5, "pixels", "side of the window of the local surface", "", 3, 15)
+    local_least: int = knob(6, "pixels", "fewest neighbours that make a surface", "", 4)
+    local_sigma: float = knob(4.5, "sigma", "largest distance of a point from the local surface", "", 0)
+    local_roughness: float = knob(2.5, "sigma", "largest rms of the neighbours about the local surface", "", 0)
+    local_rounds: int = knob(2, "", "how often the local test is repeated on what is left", "", 0, 5)
 
 
 @dataclass(frozen=True)
@@ -75,6 +93,8 @@ class FuseSettings(_Section):
     jump_sigma: float = knob(5.0, "sigma", "noise that is no jump", "", 0)
     agree_sigma: float = knob(5.0, "sigma", "views whose surfaces differ by more than this, plus agree_mm, do not see the same place", "III-C", 0)
     agree_mm: float = knob(0.05, "mm", "what the calibration may make views differ by", "III-C", 0)
+    oblique_deg: float = knob(60.0, "deg", "a view loses weight where it sees the surface at more than this from its normal", "III-C", 0, 89)
+    grazing_deg: float = knob(80.0, "deg", "and has none left at this angle, where one pixel is too wide on the surface", "III-C", 1, 90)
     blend_mm: float = knob(3.0, "mm", "width over which a view's weight rises from its border", "Fig. 12", 0)
     hole_mm: float = knob(0.6, "mm", "holes narrower than this are no border", "Fig. 12", 0)
     separation_mm: float = knob(0.05, "mm", "least sideways distance of points of different views, or half the sampling where that is more", "Fig. 12", 0)
@@ -119,6 +139,18 @@ class PatternSettings(_Section):
 
 
 @dataclass(frozen=True)
+class CaptureSettings(_Section):
+    """Playing patterns and proving that frame n is pattern n."""
+
+    exposure_us: int = knob(16000, "us", "how long each pattern is lit", "III-A", 10, 10_000_000)
+    margin_us: int = knob(200, "us", "how much longer than the pattern the cameras expose, so that they see all of it", "", 0, 1_000_000)
+    timeout_s: float = knob(5.0, "s", "how long to wait for a frame", "", 0.01, 3600)
+    retries: int = knob(2, "", "how often an incomplete shot is taken again", "", 0, 10)
+    timing_tolerance: float = knob(0.25, "periods", "how far a frame's time may lie from its pattern's", "", 0, 0.5)
+    max_wrong_frame: float = knob(0.10, "modulation", "a frame that misses its set's sinusoid by more than this, alone among the others, is not the pattern it should be", "", 0)
+
+
+@dataclass(frozen=True)
 class Settings(_Section):
     """The whole tree, as stored in every scan."""
 
@@ -127,6 +159,7 @@ class Settings(_Section):
     fuse: FuseSettings = field(default_factory=FuseSettings)
     mesh: MeshSettings = field(default_factory=MeshSettings)
     patterns: PatternSettings = field(default_factory=PatternSettings)
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:
