@@ -103,4 +103,4 @@ def put_import(folder: Path, views: tuple[ImportedView, ...], recipe: Recipe, ev
     extra: dict[str, Any] = {"imported": {c: store.plain(e.figures()) for c, e in evidence.items()}}
     store.put_capture(folder, w, h, recipe.layout, (v.view_input(recipe) for v in views), extra)
     for camera, e in evidence.items():
-        draw(e, folder / f"import-{camera}.png", camera)
+        store.write_png(folder / f"import-{camera}.png", draw(e, camera))

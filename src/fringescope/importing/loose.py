@@ -10,10 +10,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import tifffile
 
 from fringescope.errors import CaptureError, UsageError
-from fringescope.store.images import Images, check_frame
+from fringescope.store.images import Images, check_frame, stack_axes
 from fringescope.types import (
     AnyArray,
     FrameKey,
@@ -227,17 +226,7 @@ def stack_pages(path: Path, needed: int | None, axis: str | None, time: int | No
     `needed`: how many frames the recipe takes; None: as many as the axis has. Without `axis` the frames lie along the
     one axis besides time, y and x, or along the pages. Raises CaptureError or UsageError, naming the stack's axes.
     """
-    try:
-        with tifffile.TiffFile(path) as tif:
-            series = tif.series[0]
-            axes, shape = series.axes, series.shape
-            pages = len(tif.pages)
-    except FileNotFoundError:
-        raise CaptureError(f"{path}: not found; needed a folder of images or a TIFF stack") from None
-    except Exception as e:
-        why = (str(e) or repr(e)).splitlines()[0][:120]
-        raise CaptureError(f"{path}: truncated or unreadable TIFF ({why})") from e
-    sizes = {a: n for a, n in zip(axes, shape, strict=True) if a not in "YXS"}
+    sizes, pages = stack_axes(path)
     told = " x ".join(f"{a} {n}" for a, n in sizes.items()) or "one page"
     if math.prod(sizes.values()) != pages:
         raise CaptureError(f"{path}: {pages} pages for axes {told}; needed a page per picture: save it as plain pages")

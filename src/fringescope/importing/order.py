@@ -155,7 +155,7 @@ def _sense(ev: Evidence, family: list[int], code: tuple[float, float] | None) ->
     finest = ev.sets[family[-1]]
     for i in family[:-1]:
         if _dot(ev.sets[i].slope, finest.slope) * _sign(ev.sets[i].set, finest.set) < 0:
-            ev.against.append(f"the phase of set {i} grows against that of set {finest.index}: one of them runs backwards")
+            ev.against.append(f"the phases of sets {i} and {finest.index} grow against each other: one runs backwards")
             ev.options.append(f"--reverse-sets {i}")
     if code is not None and not ev.against:
         along_axis = 1.0 if sum(finest.set.cycles_per_pixel) > 0 else -1.0
@@ -206,8 +206,8 @@ def _chain(ev: Evidence, family: list[int], recipe: Recipe, sense_known: bool) -
     if same:
         x, y = ev.sets[family[-1]].slope
         way = ("right" if x > 0 else "left") if abs(x) > abs(y) else ("down" if y > 0 else "up")
-        ev.notes.append(f"the images fit {' or '.join(same)} as well; as given, the projector's coordinate grows to the "
-                        f"{way} of the picture: see that it did")
+        ev.notes.append(f"the images fit {' or '.join(same)} as well; as given, the projector's coordinate grows "
+                        f"{way} in the picture: see that it did")
 
 
 def _misfits(sets: list[SetEvidence], lit: Bool, recipe: Recipe, reverse: bool, turn: float) -> list[float]:

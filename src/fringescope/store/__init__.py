@@ -11,6 +11,7 @@ from fringescope.store.capture import (
     write_capture,
 )
 from fringescope.store.files import new_file, new_folder
+from fringescope.store.images import write_png, write_tiff
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
 from fringescope.store.scan import (
     StoredScan,
@@ -44,6 +45,8 @@ __all__ = [
     "view_inputs",
     "write_capture",
     "write_decoded",
+    "write_png",
     "write_rig",
     "write_scan",
+    "write_tiff",
 ]

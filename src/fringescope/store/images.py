@@ -153,6 +153,22 @@ class Images:
             raise CaptureError(f"{path}: truncated or unreadable TIFF ({_first_line(e)})") from e
 
 
+def stack_axes(path: Path) -> tuple[dict[str, int], int]:
+    """Sizes of a TIFF stack's axes other than x, y and samples, slowest first, as in {"T": 50, "Z": 3}; and its pages.
+
+    Raises CaptureError if it is no TIFF.
+    """
+    try:
+        with tifffile.TiffFile(path) as tif:
+            series = tif.series[0]
+            axes = dict(zip(series.axes, series.shape, strict=True))
+            return {a: n for a, n in axes.items() if a not in "YXS"}, len(tif.pages)
+    except FileNotFoundError:
+        raise CaptureError(f"{path}: not found; needed a folder of images or a TIFF stack") from None
+    except Exception as e:
+        raise CaptureError(f"{path}: truncated or unreadable TIFF ({_first_line(e)})") from e
+
+
 def _first_line(e: BaseException) -> str:
     lines = str(e).splitlines()
     return lines[0][:120] if lines else type(e).__name__
