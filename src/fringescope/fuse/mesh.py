@@ -69,6 +69,24 @@ def _crumbs(faces: NDArray[np.int64], xyz: F32, min_area: float) -> Bool:
     return np.asarray(total[label] >= min_area)
 
 
+def _two_sided(faces: NDArray[np.int64], xyz: F32) -> NDArray[np.int64]:
+    """Drop the smallest triangles at edges that more than two of them share, which a simplification may leave."""
+    while len(faces):
+        ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        key = ends[:, 0] * len(xyz) + ends[:, 1]
+        _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
+        crowded = np.flatnonzero(count[edge] > 2)
+        if not len(crowded):
+            break
+        area = np.empty(len(faces), np.float64)
+        k.areas(faces, xyz, area)
+        face = crowded % len(faces)
+        order = np.lexsort((area[face], edge[crowded]))
+        first = np.unique(edge[crowded][order], return_index=True)[1]
+        faces = np.delete(faces, face[order[first]], axis=0)
+    return faces
+
+
 def _one_fan(faces: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Drop triangles until no vertex joins two fans, so that the surface is a manifold with border."""
     while len(faces):
@@ -174,6 +192,7 @@ def surface(fused: Fused, rig: Rig, s: MeshSettings | None = None) -> tuple[Surf
                                "look at the reasons per view, or raise mesh.max_edge")
     levels = []
     for triangles, error in ((s.triangles, s.max_error_mm), (s.preview_triangles, 4 * s.max_error_mm)):
-        faces = _one_fan(_outward(_simplify(faces, p.xyz, triangles, error), p.xyz, rig), len(p.xyz))
+        faces = _outward(_simplify(faces, p.xyz, triangles, error), p.xyz, rig)
+        faces = _one_fan(_two_sided(faces, p.xyz), len(p.xyz))
         levels.append(_assemble(faces, p, fused, rig))
     return tuple(levels)

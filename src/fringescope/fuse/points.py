@@ -45,6 +45,7 @@ class _View:
     centre: F64
     normal: F32
     sigma_n: F32
+    cosine: F32
     weight: F32
     rgb: F32
     colour_weight: F32
@@ -87,7 +88,7 @@ def _rise(mask: Bool, width: float) -> F32:
 
 
 def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: FuseSettings) -> _View:
-    """Weights of one view: 1 / sigma^2 along the normal, times the cosine of incidence, times its rise from borders."""
+    """Weights of one view: cosine of incidence / sigma^2 along the normal, times its rise from borders and grazing."""
     centre = geometry.centre(rig.cameras[grid.view].pose)
     n = normals(grid, rig, s)
     cosine, step = np.empty_like(grid.sigma), np.empty_like(grid.sigma)
@@ -101,7 +102,9 @@ def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: Fu
     padded = cv2.copyMakeBorder(valid.astype(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
     whole = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disk)[reach:-reach, reach:-reach] > 0
     rise = _rise(whole, s.blend_mm / spacing if spacing > 0 else 1.0)
-    rise = np.maximum(rise, 1e-3)
+    low, high = np.cos(np.radians([s.grazing_deg, s.oblique_deg]))
+    front = np.clip((cosine - low) / max(high - low, 1e-6), 0.0, 1.0)
+    rise = np.maximum(rise * front * front * (3 - 2 * front), 1e-3)
     with np.errstate(invalid="ignore"):
         sigma_n = grid.sigma * np.maximum(cosine, 0.05)
         weight = np.where(valid, rise * cosine / np.maximum(sigma_n, 1e-6) ** 2, 0.0)
@@ -111,7 +114,7 @@ def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: Fu
     if colourless:
         colour_weight *= 1e-6
     rgb = photo.rgb * gain.astype(np.float32)
-    return _View(grid, centre, n, sigma_n.astype(np.float32), weight, rgb, colour_weight.astype(np.float32), spacing)
+    return _View(grid, centre, n, sigma_n.astype(np.float32), cosine, weight, rgb, colour_weight.astype(np.float32), spacing)
 
 
 def _views(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings) -> tuple[list[_View], F64]:
@@ -150,8 +153,8 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
             for slot, b in enumerate(others):
                 w = views[b]
                 k.gather(v.grid.xyz, v.normal, v.sigma_n, v.centre, row0, row1, poses[b].R, poses[b].t, lenses[b],
-                         w.grid.xyz, w.normal, w.sigma_n, w.weight, w.rgb, w.colour_weight, s.agree_sigma, s.agree_mm,
-                         np.uint8(1 << b), shift, total, variance, facing, seen[row0:row1], samples[slot])
+                         w.grid.xyz, w.normal, w.sigma_n, w.cosine, w.weight, w.rgb, w.colour_weight, s.agree_sigma,
+                         s.agree_mm, np.uint8(1 << b), shift, total, variance, facing, seen[row0:row1], samples[slot])
             k.settle(v.grid.xyz, v.normal, v.sigma_n, v.weight, v.centre, row0, row1, shift, total, variance, facing,
                      xyz, n, sigma)
             k.blend(samples, s.gloss, row0, v.rgb, v.colour_weight, colour)

@@ -120,18 +120,20 @@ def spacing(xyz, out):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def gather(xyz, normal, sigma_n, centre, row0, row1, R, t, lens, xyz_w, normal_w, sigma_w, weight_w, rgb_w, colour_w,
-           agree_sigma, agree_mm, bit, shift, total, variance, facing, seen, sample):
+def gather(xyz, normal, sigma_n, centre, row0, row1, R, t, lens, xyz_w, normal_w, sigma_w, cosine_w, weight_w, rgb_w,
+           colour_w, agree_sigma, agree_mm, bit, shift, total, variance, facing, seen, sample):
     """What view w says about the rays of rows `row0` to `row1` of another view; sums go into the band's arrays.
 
     A point P is projected into view w (rotation R, translation t, `lens`) and compared with the one sample Q of the
     nearest pixel. Along the mean m of both normals, which is perpendicular to the chord PQ of any surface of second
-    order, the views differ by s = (Q - P) . m. They agree if abs(s) <= agree_sigma * sqrt(sp^2 + sq^2) + agree_mm.
+    order, the views differ by s = (Q - P) . m. They agree if abs(s) <= agree_sigma * sqrt(sp^2 + sq^2) + agree_mm and Q
+    is no farther from P than a pixel of w is wide on the surface: on a sphere the chord to any Q has s = 0.
     Then s, turned into a shift along P's own ray, counts with weight_w: `shift` += w s / (m . d), `total` += w,
     `variance` += w^2 sq^2, `facing` (3) += w n; `seen` gets `bit`; `sample` (.., 4) the colour of view w at P
     (bilinear) and its weight, or weight 0.
     """
     H, W = xyz_w.shape[0], xyz_w.shape[1]
+    inverse_focal = 1.0 / math.sqrt(lens[0] * lens[1])
     for i in prange(row0, row1):
         b = i - row0
         for j in range(xyz.shape[1]):
@@ -156,9 +158,12 @@ def gather(xyz, normal, sigma_n, centre, row0, row1, R, t, lens, xyz_w, normal_w
             if mx * mx + my * my + mz * mz < 1.0:
                 continue
             mx, my, mz = _unit(mx, my, mz)
-            s = (xyz_w[qi, qj, 0] - px) * mx + (xyz_w[qi, qj, 1] - py) * my + (xyz_w[qi, qj, 2] - pz) * mz
+            cx, cy, cz = xyz_w[qi, qj, 0] - px, xyz_w[qi, qj, 1] - py, xyz_w[qi, qj, 2] - pz
+            s = cx * mx + cy * my + cz * mz
             sp, sq = sigma_n[i, j], sigma_w[qi, qj]
-            if not abs(s) <= agree_sigma * math.sqrt(sp * sp + sq * sq) + agree_mm:
+            limit = agree_sigma * math.sqrt(sp * sp + sq * sq) + agree_mm
+            reach = Z * inverse_focal / max(cosine_w[qi, qj], 0.05) + limit
+            if not (abs(s) <= limit and cx * cx + cy * cy + cz * cz <= reach * reach):
                 continue
             dx, dy, dz = _unit(px - centre[0], py - centre[1], pz - centre[2])
             slope = mx * dx + my * dy + mz * dz
