@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from fringescope import geometry, store
 from fringescope.settings import describe
-from fringescope.types import Reason
+from fringescope.types import FringeSet, Reason
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "fringescope"
@@ -234,6 +238,26 @@ def test_formats_page_names_every_reason() -> None:
     text = (DOCS / "formats.md").read_text()
     for reason in Reason:
         assert re.search(rf"\|\s*{reason.value}\s*\|\s*{re.escape(reason.label)}\s*\|", text), reason
+
+
+def test_the_examples_on_the_formats_page_are_read(tmp_path: Path) -> None:
+    blocks = re.findall(r"```json\n(.*?)```", (DOCS / "formats.md").read_text(), flags=re.S)
+    examples = [json.loads(block) for block in blocks if block.count('{"pattern"') < 2]
+    rig = next(e for e in examples if e.get("format") == "fringescope-rig")
+    (tmp_path / "rig.json").write_text(json.dumps(rig))
+    read = store.read_rig(tmp_path / "rig.json")
+    assert geometry.centre(read.cameras[0].pose) == pytest.approx([320, 0, 500], abs=0.1)
+    assert geometry.centre(read.projector.pose) == pytest.approx([0, 0, 500])
+    for d in read.devices:
+        middle = [(d.lens.width - 1) / 2, (d.lens.height - 1) / 2]
+        assert geometry.project(d, [0, 0, 0]) == pytest.approx(middle, abs=0.1)
+    capture = next(e for e in examples if e.get("format") == "fringescope-capture")
+    (tmp_path / "camera1").mkdir()
+    for name in [*capture["views"][0]["sets"][0]["frames"], capture["views"][0]["color"]]:
+        assert cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
+    (tmp_path / "capture.json").write_text(json.dumps(capture))
+    plan = store.read_capture(tmp_path).views[0].plan
+    assert (plan.camera, plan.sets[0]) == ("camera1", FringeSet((0.0, 0.000877), 4))
 
 
 def test_settings_page_names_every_setting() -> None:
