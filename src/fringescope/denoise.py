@@ -1,0 +1,148 @@
+"""The three masks of section III-D and a fourth, as reason codes per pixel (Figs. 7, 10, 11).
+
+1 background and modulation, 2 phase monotonicity, 3 phase jumps and contiguous domains; then 4: each phase within some
+of its own sigmas of the local surface, and, where views overlap, their agreement. Masks take points away, they never
+move one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from fringescope import geometry
+from fringescope.kernels import regions as k
+from fringescope.settings import DenoiseSettings
+from fringescope.types import F64, U16, Bool, Decoded, Direction, Grid, PixelFormat, Reason, Rig, WrappedSet
+
+
+def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> U16:
+    """III-D 1: dark, saturated and low-modulation pixels, as reason codes (H, W).
+
+    The modulation must exceed a floor in codes, a share of the background, a number of standard deviations of the sensor
+    noise at that background (bright and dark regions get different thresholds, V-D), and leave a phase that is not much
+    noisier than usual. Where the finest fringes have lost more contrast against the next coarser ones than is usual
+    around, the light came by way of other places (from surface to surface, below the surface): low modulation too.
+    """
+    out = decoded.reasons.copy()
+    scale = pixel_format.max_value / 255.0
+    A, B = decoded.background, decoded.modulation
+    if not decoded.sets:  # Gray code alone: background and modulation are the contrast of the bits
+        out[s.min_modulation * scale > B] |= np.uint16(Reason.LOW_MODULATION)
+        return out
+    dark = s.min_background * scale > A
+    noise = np.sqrt(decoded.noise.a + decoded.noise.b * np.maximum(A, 0))
+    low = (s.min_modulation * scale > B) | (s.min_contrast * A > B) | (s.min_modulation_sigma * noise > B)
+    out[dark] |= np.uint16(Reason.DARK)
+    out[low] |= np.uint16(Reason.LOW_MODULATION)
+    for d in decoded.directions:
+        family = [w for w in decoded.sets if abs(d.g[0] * w.g[1] - d.g[1] * w.g[0]) < 1e-4 * _norm(d.g) * _norm(w.g)]
+        family.sort(key=lambda w: _norm(w.g))
+        if not family:
+            continue
+        clipped = (family[-1].saturated > 0) & ~np.isfinite(d.sigma)
+        out[clipped] |= np.uint16(Reason.SATURATED)
+        out[clipped] &= ~np.uint16(Reason.LOW_MODULATION | Reason.ORDER_UNCERTAIN)
+        ok = out == 0
+        if ok.any():
+            out[ok & (d.sigma > s.max_sigma_factor * np.median(d.sigma[ok]))] |= np.uint16(Reason.LOW_MODULATION)
+        if len(family) > 1:
+            out[ok & _fine_contrast_lost(family[-2], family[-1], ok, s)] |= np.uint16(Reason.LOW_MODULATION)
+    out[dark] &= ~np.uint16(Reason.ORDER_UNCERTAIN | Reason.INCONSISTENT)
+    return out
+
+
+def _norm(g: tuple[float, float]) -> float:
+    return float(np.hypot(*g))
+
+
+def _fine_contrast_lost(coarse: WrappedSet, fine: WrappedSet, ok: Bool, s: DenoiseSettings) -> Bool:
+    """Where B(fine) / B(coarse) falls below `min_fine_modulation` of its median around (tiles of an eighth)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(ok & (coarse.saturated == 0) & (fine.saturated == 0), fine.modulation / coarse.modulation, np.nan)
+    if not np.isfinite(ratio).any():
+        return np.zeros(ok.shape, np.bool_)
+    H, W = ok.shape
+    usual = np.full((8, 8), np.nanmedian(ratio), np.float32)
+    for a in range(8):
+        for b in range(8):
+            tile = ratio[a * H // 8 : (a + 1) * H // 8, b * W // 8 : (b + 1) * W // 8]
+            tile = tile[np.isfinite(tile)]
+            if tile.size > max(16, H * W // 640):
+                usual[a, b] = np.median(tile)
+    around = cv2.resize(cv2.blur(usual, (3, 3)), (W, H), interpolation=cv2.INTER_LINEAR)
+    allowance = 2.0 * fine.sigma  # sigma of B over B is that of the phase
+    return np.asarray(ratio * (1 + allowance) < s.min_fine_modulation * around)
+
+
+def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings) -> U16:
+    """III-D 2: fringes that run backwards come mirrored, from the substrate (equation 17).
+
+    On every surface that faces camera and projector the phase grows along the image of the projector's rays in one
+    sense, which the rig predicts at each pixel. Neighbours vote, so that noise on flat phase marks nothing.
+    """
+    out = reasons.copy()
+    H, W = decoded.shape
+    reach = max(1, round(s.monotonic_reach * W / 684))
+    for d in decoded.directions:
+        field = geometry.epipolar_field(rig, rig.camera(decoded.camera), d.g)
+        signs, back = np.empty((H, W), np.int8), np.empty((H, W), np.bool_)
+        k.gradient_signs(d.phase, d.sigma, out, field, reach, s.monotonic_sigma, signs)
+        k.majority_backward(signs, int(s.monotonic_window) // 2, s.monotonic_share, 4, back)
+        out[back & (out == 0)] |= np.uint16(Reason.REVERSED)
+    return out
+
+
+def connected(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -> U16:
+    """III-D 3: neighbours whose phases differ by less than T1 form domains; domains of fewer than T2 pixels go.
+
+    Pixels that continue too few of their neighbours stand on a jump and go first.
+    """
+    out = reasons.copy()
+    for d in decoded.directions:
+        field = _slopes(d, reasons, decoded, rig)
+        loose = np.empty(decoded.shape, np.bool_)
+        k.loose_pixels(
+            d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, int(s.jump_links), loose
+        )
+        out[loose] |= np.uint16(Reason.JUMP)
+        label = np.empty(decoded.shape, np.int32)
+        sizes = k.domains(d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, label)
+        small = np.append(sizes < s.island_share * decoded.background.size, False)
+        out[small[label] & (label >= 0)] |= np.uint16(Reason.ISLAND)
+    return out
+
+
+def local(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -> U16:
+    """The fourth test: a point's phase lies within some of its own sigmas of the surface of its neighbours."""
+    out = reasons.copy()
+    for d in decoded.directions:
+        for _ in range(int(s.local_rounds)):
+            field = _slopes(d, out, decoded, rig)
+            label = np.empty(decoded.shape, np.int32)
+            k.domains(d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, label)
+            distance, roughness = np.empty(decoded.shape, np.float32), np.empty(decoded.shape, np.float32)
+            k.local_surface(d.phase, d.sigma, label, int(s.local_window) // 2, int(s.local_least), distance, roughness)
+            bad = (out == 0) & ~((distance <= s.local_sigma) & (roughness <= s.local_roughness))
+            out[bad] |= np.uint16(Reason.NOT_LOCAL)
+    return out
+
+
+def _slopes(d: Direction, reasons: U16, decoded: Decoded, rig: Rig | None) -> F64:
+    """Expected phase growth per pixel, as channel 2 of a coarse field: from the rig, or the usual one of the image."""
+    if rig is not None:
+        return geometry.epipolar_field(rig, rig.camera(decoded.camera), d.g)
+    ok = reasons == 0
+    usual = 0.0
+    for axis in (0, 1):
+        a = np.diff(np.where(ok, d.phase, np.nan), axis=axis)
+        a = a[np.isfinite(a)]
+        usual = max(usual, float(np.median(np.abs(a)))) if a.size else usual
+    return np.full((2, 2, 3), usual or 1.0)
+
+
+def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings) -> tuple[Grid, ...]:
+    """Where views overlap, points that the other views contradict go."""
+    return tuple(grids)

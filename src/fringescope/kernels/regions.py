@@ -1,0 +1,272 @@
+"""Neighbourhoods of the phase image: gradient votes, contiguous domains, the local surface. Arrays and scalars only."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _spread(field, i, j, H, W, c):
+    """Channel c of a coarse field (h, w, C) that spans the image corner on corner, at pixel (i, j)."""
+    h, w = field.shape[0], field.shape[1]
+    y = i * (h - 1) / max(H - 1, 1)
+    x = j * (w - 1) / max(W - 1, 1)
+    y0 = min(int(y), max(h - 2, 0))
+    x0 = min(int(x), max(w - 2, 0))
+    y1 = min(y0 + 1, h - 1)
+    x1 = min(x0 + 1, w - 1)
+    fy = y - y0
+    fx = x - x0
+    return (1 - fy) * ((1 - fx) * field[y0, x0, c] + fx * field[y0, x1, c]) + fy * (
+        (1 - fx) * field[y1, x0, c] + fx * field[y1, x1, c]
+    )
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def gradient_signs(phase, sigma, reasons, field, reach, significance, out):
+    """Sign of the phase's growth along the predicted direction (equation 17): 1 forward, -1 backward, 0 unknown.
+
+    `field` (h, w, 3) holds the unit direction (du, dv). The difference is taken over `reach` pixels on either side, or on
+    one where the other is masked; it must exceed `significance` standard deviations to count.
+    """
+    H, W = phase.shape
+    for i in prange(H):
+        for j in range(W):
+            out[i, j] = 0
+            if reasons[i, j] != 0:
+                continue
+            du = _spread(field, i, j, H, W, 0)
+            dv = _spread(field, i, j, H, W, 1)
+            n = math.hypot(du, dv)
+            if not n > 0.0:
+                continue
+            x = int(round(reach * du / n))
+            y = int(round(reach * dv / n))
+            a, b = phase[i, j], phase[i, j]
+            va = vb = sigma[i, j] ** 2
+            if 0 <= i + y < H and 0 <= j + x < W and reasons[i + y, j + x] == 0:
+                a = phase[i + y, j + x]
+                va = sigma[i + y, j + x] ** 2
+            if 0 <= i - y < H and 0 <= j - x < W and reasons[i - y, j - x] == 0:
+                b = phase[i - y, j - x]
+                vb = sigma[i - y, j - x] ** 2
+            if abs(a - b) > significance * math.sqrt(va + vb):
+                out[i, j] = 1 if a > b else -1
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def majority_backward(signs, radius, share, least, out):
+    """Where the signs in the window are backward by at least `share` of at least `least` votes: a contiguous reversal."""
+    H, W = signs.shape
+    for i in prange(H):
+        for j in range(W):
+            out[i, j] = False
+            back = votes = 0
+            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+                for x in range(max(j - radius, 0), min(j + radius + 1, W)):
+                    if signs[y, x] != 0:
+                        votes += 1
+                        if signs[y, x] < 0:
+                            back += 1
+            if votes >= least and back >= share * votes:
+                out[i, j] = True
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+    """Whether two neighbouring pixels continue one surface: their phases differ by less than T1.
+
+    T1 = `factor` times the growth that a surface facing both devices has at this pixel (channel 2 of `field`, radians
+    per pixel), at least `floor`, plus `noise` standard deviations.
+    """
+    limit = max(factor * _spread(field, i, j, H, W, 2), floor)
+    limit += noise * math.sqrt(sigma[i, j] ** 2 + sigma[y, x] ** 2)
+    return abs(phase[i, j] - phase[y, x]) < limit
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def loose_pixels(phase, sigma, reasons, field, factor, floor, noise, least, out):
+    """Pixels that continue the surface of fewer than `least` of their eight neighbours: they stand on a jump."""
+    H, W = phase.shape
+    for i in prange(H):
+        for j in range(W):
+            out[i, j] = False
+            if reasons[i, j] != 0:
+                continue
+            links = 0
+            for y in range(max(i - 1, 0), min(i + 2, H)):
+                for x in range(max(j - 1, 0), min(j + 2, W)):
+                    if (y != i or x != j) and reasons[y, x] == 0:
+                        if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+                            links += 1
+            out[i, j] = links < least
+
+
+@njit(cache=True, error_model="numpy")
+def _root(parent, a):
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = parent[a]
+    return a
+
+
+@njit(cache=True, error_model="numpy")
+def domains(phase, sigma, reasons, field, factor, floor, noise, label):
+    """Contiguous domains of four-connected pixels that are `linked` (union-find): labels (H, W) int32, -1 = masked.
+
+    Returns the number of pixels of every label.
+    """
+    H, W = phase.shape
+    parent = np.arange(H * W)
+    for i in range(H):
+        for j in range(W):
+            if reasons[i, j] != 0:
+                continue
+            if j > 0 and reasons[i, j - 1] == 0:
+                if linked(phase, sigma, field, factor, floor, noise, i, j, i, j - 1, H, W):
+                    a, b = _root(parent, i * W + j), _root(parent, i * W + j - 1)
+                    parent[max(a, b)] = min(a, b)
+            if i > 0 and reasons[i - 1, j] == 0:
+                if linked(phase, sigma, field, factor, floor, noise, i, j, i - 1, j, H, W):
+                    a, b = _root(parent, i * W + j), _root(parent, (i - 1) * W + j)
+                    parent[max(a, b)] = min(a, b)
+    count = 0
+    for a in range(H * W):
+        i, j = a // W, a % W
+        if reasons[i, j] != 0:
+            label[i, j] = -1
+        elif parent[a] == a:
+            label[i, j] = count
+            count += 1
+        else:
+            r = _root(parent, a)
+            label[i, j] = label[r // W, r % W]
+    sizes = np.zeros(count, np.int64)
+    for i in range(H):
+        for j in range(W):
+            if label[i, j] >= 0:
+                sizes[label[i, j]] += 1
+    return sizes
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _solve(M, rhs, n):
+    """Solve the symmetric positive definite n x n system in place by Cholesky; the (0, 0) of the inverse comes back too.
+
+    Returns (ok, inverse00); the solution is in `rhs`.
+    """
+    for a in range(n):
+        for b in range(a + 1):
+            s = M[a, b]
+            for c in range(b):
+                s -= M[a, c] * M[b, c]
+            if a == b:
+                if s <= 1e-12:
+                    return False, 0.0
+                M[a, a] = math.sqrt(s)
+            else:
+                M[a, b] = s / M[b, b]
+    inv00 = 0.0
+    e = np.zeros(6)
+    e[0] = 1.0
+    for a in range(n):
+        s = rhs[a]
+        t = e[a]
+        for c in range(a):
+            s -= M[a, c] * rhs[c]
+            t -= M[a, c] * e[c]
+        rhs[a] = s / M[a, a]
+        e[a] = t / M[a, a]
+        inv00 += e[a] * e[a]
+    for a in range(n - 1, -1, -1):
+        s = rhs[a]
+        for c in range(a + 1, n):
+            s -= M[c, a] * rhs[c]
+        rhs[a] = s / M[a, a]
+    return True, inv00
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def local_surface(phase, sigma, label, radius, least, out, roughness):
+    """Distance of each pixel's phase from the surface of its neighbours, in standard deviations; NaN where too few.
+
+    The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain in the window,
+    without the pixel itself, by least squares with weights 1 / sigma^2 that let go of outliers (Cauchy at 2.5 sigma).
+    `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
+    """
+    H, W = phase.shape
+    for i in prange(H):
+        M = np.empty((6, 6))
+        rhs = np.empty(6)
+        coefficient = np.zeros(6)
+        basis = np.empty(6)
+        basis[0] = 1.0
+        for j in range(W):
+            out[i, j] = np.nan
+            roughness[i, j] = np.nan
+            own = label[i, j]
+            if own < 0:
+                continue
+            n = 0
+            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+                for x in range(max(j - radius, 0), min(j + radius + 1, W)):
+                    if label[y, x] == own:
+                        n += 1
+            n -= 1
+            if n < least:
+                continue
+            terms = 6 if n >= 12 else 3
+            inv00 = 0.0
+            spread = 0.0
+            fine = False
+            for sweep in range(4):
+                for a in range(terms):
+                    rhs[a] = 0.0
+                    for b in range(a + 1):
+                        M[a, b] = 0.0
+                worst = 0.0
+                spread = 0.0
+                weight_sum = 0.0
+                for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+                    for x in range(max(j - radius, 0), min(j + radius + 1, W)):
+                        if label[y, x] != own or (y == i and x == j):
+                            continue
+                        dx = float(x - j)
+                        dy = float(y - i)
+                        basis[1] = dx
+                        basis[2] = dy
+                        basis[3] = dx * dx
+                        basis[4] = dx * dy
+                        basis[5] = dy * dy
+                        value = phase[y, x] - phase[i, j]
+                        s = sigma[y, x]
+                        w = 1.0
+                        if sweep > 0:
+                            r = value
+                            for a in range(terms):
+                                r -= coefficient[a] * basis[a]
+                            z2 = (r / s) ** 2
+                            worst = max(worst, z2)
+                            w = 1.0 / (1.0 + z2 / 6.25)
+                            spread += w * z2
+                            weight_sum += w
+                        w /= s * s
+                        for a in range(terms):
+                            rhs[a] += w * basis[a] * value
+                            for b in range(a + 1):
+                                M[a, b] += w * basis[a] * basis[b]
+                if sweep > 0:
+                    spread = math.sqrt(spread / max(weight_sum * (1.0 - terms / n), 1.0))
+                    if worst < 9.0 or sweep == 3:
+                        fine = True
+                        break
+                ok, inv00 = _solve(M, rhs, terms)
+                if not ok:
+                    break
+                for a in range(terms):
+                    coefficient[a] = rhs[a]
+            if fine:
+                yardstick = math.sqrt(sigma[i, j] ** 2 + inv00) * max(spread, 1.0)
+                out[i, j] = abs(coefficient[0]) / yardstick
+                roughness[i, j] = spread
