@@ -106,81 +106,140 @@ def refine_triangle_hits(origins, dirs, prim, vertices, faces, normals, t, n):
             n[i, k] *= s
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def blur(image, taps, scratch, out):
     """Separable symmetric blur of (h, w) float32 by `taps` (2, r + 1): half kernels along v and u; edges repeat."""
     h, w = image.shape
-    r = taps.shape[1] - 1
-    for y in prange(h):
-        for x in range(w):
-            scratch[y, x] = taps[0, 0] * image[y, x]
+    r = min(taps.shape[1] - 1, (w - 1) // 2)
+    for y in range(h):
+        row = scratch[y]
+        row[:] = taps[0, 0] * image[y]
         for k in range(1, r + 1):
-            a, b, c = max(y - k, 0), min(y + k, h - 1), taps[0, k]
-            if c != 0.0:
-                for x in range(w):
-                    scratch[y, x] += c * (image[a, x] + image[b, x])
-    for y in prange(h):
-        for x in range(w):
-            out[y, x] = taps[1, 0] * scratch[y, x]
+            above, below, c = image[max(y - k, 0)], image[min(y + k, h - 1)], taps[0, k]
+            for x in range(w):
+                row[x] += c * (above[x] + below[x])
+        target = out[y]
+        target[:] = taps[1, 0] * row
         for k in range(1, r + 1):
-            c = taps[1, k]
-            if c != 0.0:
-                for x in range(k, w - k):
-                    out[y, x] += c * (scratch[y, x - k] + scratch[y, x + k])
-                for x in range(min(k, w)):
-                    out[y, x] += c * (scratch[y, 0] + scratch[y, min(x + k, w - 1)])
-                for x in range(max(w - k, k), w):
-                    out[y, x] += c * (scratch[y, max(x - k, 0)] + scratch[y, w - 1])
+            c, left, right, middle = taps[1, k], row[: w - 2 * k], row[2 * k :], target[k : w - k]
+            for x in range(w - 2 * k):
+                middle[x] += c * (left[x] + right[x])
+            for x in range(k):
+                target[x] += c * (row[0] + row[x + k])
+                target[w - 1 - x] += c * (row[w - 1 - x - k] + row[w - 1])
 
 
 @njit(cache=True, nogil=True)
-def _bilinear(a, x, y):
+def _cubic(a, x, y):
+    """Catmull-Rom interpolation of (h, w) at column x, row y; 0 outside."""
     h, w = a.shape
-    if not (x >= 0.0 and y >= 0.0 and x <= w - 1.001 and y <= h - 1.001):
+    if not (x >= 1.0 and y >= 1.0 and x < w - 2.0 and y < h - 2.0):
         return np.float32(0.0)
     i, j = int(x), int(y)
-    fx, fy = np.float32(x - i), np.float32(y - j)
-    top = a[j, i] + fx * (a[j, i + 1] - a[j, i])
-    low = a[j + 1, i] + fx * (a[j + 1, i + 1] - a[j + 1, i])
-    return top + fy * (low - top)
+    f = np.float32(x - i)
+    g = np.float32(y - j)
+    half = np.float32(0.5)
+    a0 = half * f * (-1 + f * (2 - f))
+    a1 = 1 + half * f * f * (-5 + 3 * f)
+    a2 = half * f * (1 + f * (4 - 3 * f))
+    a3 = half * f * f * (f - 1)
+    b0 = half * g * (-1 + g * (2 - g))
+    b1 = 1 + half * g * g * (-5 + 3 * g)
+    b2 = half * g * (1 + g * (4 - 3 * g))
+    b3 = half * g * g * (g - 1)
+    r0 = a0 * a[j - 1, i - 1] + a1 * a[j - 1, i] + a2 * a[j - 1, i + 1] + a3 * a[j - 1, i + 2]
+    r1 = a0 * a[j, i - 1] + a1 * a[j, i] + a2 * a[j, i + 1] + a3 * a[j, i + 2]
+    r2 = a0 * a[j + 1, i - 1] + a1 * a[j + 1, i] + a2 * a[j + 1, i + 1] + a3 * a[j + 1, i + 2]
+    r3 = a0 * a[j + 2, i - 1] + a1 * a[j + 2, i] + a2 * a[j + 2, i + 1] + a3 * a[j + 2, i + 2]
+    return b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
 
 
 @njit(cache=True, nogil=True)
-def light_at(fine, coarse, u, v, level):
-    """Light at (u, v): between level 0 (`fine`, unit spacing) and 1, 2 .. (`coarse` (L, h/2, w/2)); linear in `level`.
-
-    (u, v) are counted from the top-left sample of `fine`; a coarse sample covers two by two fine ones.
-    """
-    k = int(level)
+def light_at(levels, x, y, level):
+    """Light at column x, row y of `levels` (L, h, w), between two of them; linear in `level`, clipped at the last."""
+    k = min(int(level), levels.shape[0] - 1)
     f = np.float32(level - k)
-    x, y = 0.5 * u - 0.25, 0.5 * v - 0.25
-    top = coarse.shape[0]
-    if k >= top:
-        return _bilinear(coarse[top - 1], x, y)
-    a = _bilinear(fine, u, v) if k == 0 else _bilinear(coarse[k - 1], x, y)
-    if f > 0.0:
-        a += f * (_bilinear(coarse[k], x, y) - a)
-    return a
+    a = _cubic(levels[k], x, y)
+    if f > 0.0 and k + 1 < levels.shape[0]:
+        a += f * (_cubic(levels[k + 1], x, y) - a)
+    return max(a, np.float32(0.0))
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def gather(fine, coarse, u, v, level, gain, steady, out):
-    """Signal of every pixel: `steady` (n,) plus the sum of its rays' gain times light; ray arrays are (n, rays)."""
-    n, s = u.shape
-    for i in prange(n):
-        total = steady[i]
-        for j in range(s):
-            g = gain[i, j]
-            if g > 0.0:
-                total += g * light_at(fine, coarse, u[i, j], v[i, j], level[i, j])
-        out[i] = total
+def gather(levels, x, y, level, gain, steady, out):
+    """Signal of every pixel (n,): `steady` plus its gain times the light where it looks."""
+    for i in prange(x.size):
+        g = gain[i]
+        out[i] = steady[i] + (g * light_at(levels, x[i], y[i], level[i]) if g > 0.0 else np.float32(0.0))
 
 
 @njit(cache=True, nogil=True)
-def gather_sparse(fine, coarse, pixel, u, v, level, gain, out):
+def gather_sparse(levels, pixel, x, y, level, gain, out):
     """Adds gain times light of each listed ray to its pixel."""
     for i in range(pixel.shape[0]):
-        out[pixel[i]] += gain[i] * light_at(fine, coarse, u[i], v[i], level[i])
+        out[pixel[i]] += gain[i] * light_at(levels, x[i], y[i], level[i])
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def bilinear(values, x0, y0, step, points, out):
+    """Looks up a raster (h, w, k) at x and y of points (n, 3) into out (n, k); edges repeat."""
+    h, w, m = values.shape
+    for i in prange(points.shape[0]):
+        x = min(max((points[i, 0] - x0) / step, 0.0), w - 1.001)
+        y = min(max((points[i, 1] - y0) / step, 0.0), h - 1.001)
+        c, r = int(x), int(y)
+        f, g = x - c, y - r
+        for k in range(m):
+            top = values[r, c, k] * (1 - f) + values[r, c + 1, k] * f
+            low = values[r + 1, c, k] * (1 - f) + values[r + 1, c + 1, k] * f
+            out[i, k] = top * (1 - g) + low * g
+
+
+@njit(cache=True, nogil=True)
+def _fresnel(f0, c):
+    m = 1.0 - min(max(c, 0.0), 1.0)
+    return f0 + (1.0 - f0) * m * m * m * m * m
+
+
+@njit(cache=True, nogil=True)
+def _lobe(nx, ny, nz, lx, ly, lz, ex, ey, ez, alpha, f0):
+    """pi times GGX reflectance (Walter et al. 2007, Schlick's Smith shadowing) for unit vectors."""
+    hx, hy, hz = lx + ex, ly + ey, lz + ez
+    s = 1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
+    nh = min(max((nx * hx + ny * hy + nz * hz) * s, 0.0), 1.0)
+    eh = (ex * hx + ey * hy + ez * hz) * s
+    nl, ne = max(nx * lx + ny * ly + nz * lz, 1e-4), max(nx * ex + ny * ey + nz * ez, 1e-4)
+    a2, k = alpha * alpha, 0.5 * alpha
+    q = nh * nh * (a2 - 1.0) + 1.0
+    return a2 / (q * q) * _fresnel(f0, eh) / ((nl * (1 - k) + k) * (ne * (1 - k) + k)) / 4.0
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def reflect(points, normals, shiny, dirs, lamp, axis, reach, falloff, alpha, f0, diffuse, tint, least_alpha, out):
+    """Light (n,) that surfaces send along -dirs from a lamp at (3,): Lambert under a film, and the film's gloss.
+
+    The lamp gives 1 at distance `reach`, falling with the square of the distance and cos(angle to its `axis`)^falloff.
+    `diffuse`, `tint` (n,): the sensor's response to the body's colour, and to white.
+    """
+    for i in prange(points.shape[0]):
+        lx, ly, lz = lamp[0] - points[i, 0], lamp[1] - points[i, 1], lamp[2] - points[i, 2]
+        r = math.sqrt(lx * lx + ly * ly + lz * lz)
+        lx, ly, lz = lx / r, ly / r, lz / r
+        cos = lx * normals[i, 0] + ly * normals[i, 1] + lz * normals[i, 2]
+        if not cos > 0.0:
+            out[i] = 0.0
+            continue
+        ex, ey, ez = -dirs[i, 0], -dirs[i, 1], -dirs[i, 2]
+        E = (reach / r) ** 2
+        if falloff > 0.0:
+            E *= max(-(lx * axis[0] + ly * axis[1] + lz * axis[2]), 0.0) ** falloff
+        value = diffuse[i]
+        if f0[i] > 0.0:
+            ne = ex * normals[i, 0] + ey * normals[i, 1] + ez * normals[i, 2]
+            value *= (1.0 - _fresnel(f0[i], ne)) * (1.0 - f0[i])
+            a = max(alpha[i], least_alpha)
+            value += tint[i] * _lobe(shiny[i, 0], shiny[i, 1], shiny[i, 2], lx, ly, lz, ex, ey, ez, a, f0[i])
+        out[i] = E * cos * value
 
 
 @njit(cache=True, nogil=True, parallel=True)

@@ -89,53 +89,59 @@ def mirror_light(image: U8, projector: Projector, optics: ProjectorOptics) -> F3
 
 
 class LightStack:
-    """One pattern at several degrees of blur: level 0 on unit cells, the others on cells of two by two.
+    """One pattern at several degrees of blur, sampled every `step` units of the projector plane (1, or 2 where all is blurred).
 
-    `sigmas` (L + 1,): standard deviations in plane units along v, growing; `aspect` = fx / fy of the projector.
+    `sigmas` (L,): standard deviations in plane units along v, growing; `aspect` = fx / fy of the projector.
     """
 
     def __init__(self, sigmas: F64, aspect: float) -> None:
         self.sigmas = np.asarray(sigmas, dtype=np.float64)
         self.aspect = aspect
+        self.step = 2 if self.sigmas[0] * min(aspect, 1.0) >= 1.3 else 1
 
-    def level(self, sigma: AnyArray) -> F32:
-        """Which (fractional) level has standard deviation `sigma`; interpolates variance, clips at both ends."""
-        v = self.sigmas**2
-        return np.interp(np.asarray(sigma, dtype=np.float64) ** 2, v, np.arange(len(v))).astype(np.float32)
+    def place(self, sigma: AnyArray, u: AnyArray, v: AnyArray) -> tuple[F32, F32, F32]:
+        """Column, row and (fractional) level at which light of standard deviation `sigma` at (u, v) is looked up.
 
-    def build(self, light: F32) -> tuple[F32, F32]:
-        """Level 0 (h, w) and levels 1.. (L, h // 2, w // 2) of `light` (h, w)."""
-        fine = _gauss(light, self.sigmas[0], self.sigmas[0] * self.aspect)
-        h, w = (light.shape[0] // 2) * 2, (light.shape[1] // 2) * 2
-        f = fine[:h, :w]
-        half = 0.25 * (f[0::2, 0::2] + f[1::2, 0::2] + f[0::2, 1::2] + f[1::2, 1::2])
-        coarse = np.empty((len(self.sigmas) - 1, *half.shape), dtype=np.float32)
-        before, current = self.sigmas[0] ** 2 + 0.25, half
-        for k, s in enumerate(self.sigmas[1:]):
-            step = math.sqrt(max(s * s - before, 0.0)) / 2
-            coarse[k] = current = _gauss(current, step, step * self.aspect)
-            before = max(s * s, before)
-        return fine, coarse
+        Between levels the variance is interpolated; beyond the last it is clipped.
+        """
+        var = self.sigmas**2
+        level = np.interp(np.asarray(sigma, dtype=np.float64) ** 2, var, np.arange(len(var)))
+        x, y = ((np.asarray(c, dtype=np.float64) + MARGIN + 0.5) / self.step - 0.5 for c in (u, v))
+        return x.astype(np.float32), y.astype(np.float32), level.astype(np.float32)
+
+    def build(self, light: F32) -> F32:
+        """All levels (L, h / step, w / step) of `light` (h, w)."""
+        a, before = light, 0.0
+        if self.step == 2:
+            h, w = (light.shape[0] // 2) * 2, (light.shape[1] // 2) * 2
+            a = 0.25 * (light[0:h:2, 0:w:2] + light[1:h:2, 0:w:2] + light[0:h:2, 1:w:2] + light[1:h:2, 1:w:2])
+            before = 0.25
+        out = np.empty((len(self.sigmas), *a.shape), dtype=np.float32)
+        scratch = np.empty_like(a)
+        for k, s in enumerate(self.sigmas):
+            sigma = math.sqrt(max(s * s - before, 0.0)) / self.step
+            loops.blur(a, _taps(sigma, sigma * self.aspect), scratch, out[k])
+            a, before = out[k], max(s * s, before)
+        return out
 
 
 def blur_levels(smallest: float, largest: float) -> F64:
-    """Standard deviations of a light stack that covers the span: a ratio of 1.6 from level to level, at least two."""
+    """Standard deviations of a light stack that covers the span: a ratio of at most 1.75 from level to level, at least two."""
     low = max(smallest, 0.4)
-    high = max(largest, 1.6 * low)
-    n = max(2, math.ceil(math.log(high / low) / math.log(1.6)) + 1)
+    high = max(largest, 1.2 * low)
+    n = max(2, math.ceil(math.log(high / low) / math.log(1.75)) + 1)
     out: F64 = low * (high / low) ** (np.arange(n) / (n - 1))
     return out
 
 
-def _gauss(image: F32, sigma_v: float, sigma_u: float) -> F32:
+def _taps(sigma_v: float, sigma_u: float) -> F32:
+    """Half kernels (2, r + 1) of a Gauss blur along v and u."""
     r = max(1, math.ceil(3.5 * max(sigma_v, sigma_u)))
     taps = np.zeros((2, r + 1), dtype=np.float32)
     for row, s in enumerate((sigma_v, sigma_u)):
         k = np.exp(-0.5 * (np.arange(r + 1) / max(s, 1e-3)) ** 2)
         taps[row] = k / (k[0] + 2 * k[1:].sum())
-    out, scratch = np.empty_like(image), np.empty_like(image)
-    loops.blur(np.ascontiguousarray(image), taps, scratch, out)
-    return out
+    return taps
 
 
 def defocus_sigma(focal_units: float, aperture_mm: float, focus_mm: float, depth: AnyArray) -> AnyArray:
@@ -149,26 +155,6 @@ def defocus_sigma(focal_units: float, aperture_mm: float, focus_mm: float, depth
 def fresnel(f0: AnyArray, cosine: AnyArray) -> AnyArray:
     """Schlick's approximation of the share of light that a surface mirrors."""
     return f0 + (1.0 - f0) * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 5
-
-
-def gloss(normal: F64, to_light: F64, to_eye: F64, alpha: AnyArray, f0: AnyArray) -> F64:
-    """pi times the GGX microfacet reflectance times the cosine of incidence (n,), so that a white Lambert surface gives that cosine.
-
-    Walter et al., Microfacet models for refraction through rough surfaces, 2007; Schlick's Smith shadowing.
-    All directions are unit vectors (n, 3).
-    """
-    half = to_light + to_eye
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    nh = np.clip(np.einsum("ij,ij->i", normal, half), 0, 1)
-    nl = np.clip(np.einsum("ij,ij->i", normal, to_light), 1e-4, 1)
-    ne = np.clip(np.einsum("ij,ij->i", normal, to_eye), 1e-4, 1)
-    eh = np.clip(np.einsum("ij,ij->i", to_eye, half), 0, 1)
-    a2 = np.maximum(alpha, 0.01) ** 2
-    D = a2 / (math.pi * (nh * nh * (a2 - 1.0) + 1.0) ** 2)
-    k = np.maximum(alpha, 0.01) / 2
-    shadow = 1.0 / ((nl * (1 - k) + k) * (ne * (1 - k) + k))
-    out: F64 = math.pi * D * fresnel(f0, eh) * shadow * nl / 4.0
-    return np.where(f0 > 0, out, 0.0)
 
 
 # ----------------------------------------------------------------------------------------------------- the camera

@@ -20,13 +20,14 @@ DMD_UNIT = 0.0054  #: mm, unit of the projector plane
 
 @dataclass(frozen=True)
 class RingLight:
-    """White lamps on a circle above the specimen: radius and height in mm, number of lamps, colour, brightness."""
+    """White lamps on a circle above the specimen: radius and height in mm."""
 
     radius: float = 90.0
     height: float = 460.0
     lamps: int = 8
     colour: tuple[float, float, float] = (0.95, 1.0, 0.90)
     brightness: float = 0.75
+    softness: float = 0.18  #: least roughness with which its lamps are mirrored: a diffuser spreads them
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """Pictures of a scene: geometry once per camera, then every pattern is a lookup of light.
 
-A pixel's signal is a sum over its rays of gain times projector light at the ray's (u, v), plus steady light. Rays per
-pixel sit where their second moments equal those of the pixel's area and the camera's defocus disc, so blur costs nothing and moves no phase.
+A pixel's signal is a sum over its rays of gain times projector light at the ray's (u, v), plus steady light. On smooth surfaces one ray serves, its light
+blurred by the pixel's footprint; at edges several rays sit where their second moments equal those of the pixel's
+area and the camera's defocus disc together. Either way blur is symmetric and moves no phase.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, PixelFormat
 
 TILE = 150_000  #: rays traced at a time
 MIRROR_MIN = 2e-4  #: mirrored light below this share of a white surface's is left out
+MIRROR_REACH = 60.0  #: mm; what is mirrored from farther away is left out
+MOST_BLUR = 10.0  #: plane units; light is not blurred more than this
+MOST_BEND = 0.3  #: plane units; second difference of (u, v) up to which a pixel's surroundings count as smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,8 @@ class ViewTruth:
 
 
 class _Sparse(NamedTuple):
+    """Further rays: the pixel that each belongs to, where it lands, its blur (plane units) and its gain."""
+
     pixel: AnyArray
     u: F32
     v: F32
@@ -46,46 +52,60 @@ class _Sparse(NamedTuple):
     gain: F32
 
 
-class _Shaded(NamedTuple):
-    """Rays (k,): their hits, projector coordinates, blur in plane units and gain per sensor channel (k, channels)."""
+class _Surface(NamedTuple):
+    """What rays (n,) found: hits, sensor response to body colour (projector's, ring's, room's light), film, scattering."""
 
     hits: Hits
+    colours: F64  #: (3, n)
+    alpha: F64
+    f0: F64
+    scatter: F64
+    shiny: F64  #: (n, 3), the normal that gloss sees
+
+
+class _Rays(NamedTuple):
+    """Rays (n,) with their projector light."""
+
+    surface: _Surface
     uv: F64
-    visible: Bool
+    lit: Bool
     sigma: F64
     gain: F64
+    room: F64
+    mirrored: _Sparse
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Geometry of one camera: ray arrays (pixels, rays), steady and ring-light signal (pixels,)."""
+    """Geometry of one camera: per pixel where it looks (columns, rows and levels of the light stack), gain, steady and ring light."""
 
-    u: F32
-    v: F32
-    sigma: F32
+    stack: optics.LightStack
+    x: F32
+    y: F32
+    level: F32
     gain: F32
-    mirrored: _Sparse
+    more: tuple[AnyArray, F32, F32, F32, F32]  #: pixel, x, y, level, gain
     steady: F32
     ring: F32
+    stray: F32  #: gain by way of other surfaces
 
 
 class Renderer:
     """Renders one scene through one instrument; keeps each camera's geometry once it has been needed.
 
-    `rays`: per pixel, 1, 4 or 9; None takes 4 up to a million pixels and 1 beyond. `mirrors`: whether wet surfaces
-    mirror what lies around them.
+    Where a pixel's surroundings are smooth, one ray serves and its footprint is blur; at edges of shape, shadow or colour `rays` (1, 4 or 9)
+    are traced. `mirrors`: whether wet surfaces mirror what lies around them.
     """
 
     def __init__(self, scene: Scene, instrument: Instrument, rays: int | None = None, mirrors: bool = True) -> None:
         if rays not in (None, 1, 4, 9):
             raise UsageError(f"rays {rays}; needed 1, 4 or 9 per pixel")
         self.scene, self.instrument = scene, instrument
-        self._rays, self._mirrors = rays, mirrors
+        self._rays, self._mirrors = rays or 4, mirrors
         self._views: dict[str, _View] = {}
-        projector = instrument.rig.projector
-        self._aspect = float(projector.lens.K[0, 0] / projector.lens.K[1, 1])
-        self._centre = -projector.pose.R.T @ projector.pose.t
-        self._reference = float(instrument.projector.focus_mm)
+        p = instrument.rig.projector
+        self._aspect = float(p.lens.K[0, 0] / p.lens.K[1, 1])
+        self._centre = -p.pose.R.T @ p.pose.t
 
     # ---------------------------------------------------------------------------------------------------- pictures
 
@@ -96,20 +116,14 @@ class Renderer:
         """
         cam = self.instrument.rig.camera(camera)
         view = self._view(cam)
-        out = np.empty(view.u.shape[0], dtype=np.float32)
         steady = view.steady + np.float32(ring * self.scene.ring) * view.ring if ring else view.steady
-        if image is None:
-            out[:] = steady
-        else:
+        out = steady.copy()
+        if image is not None and leds > 0:
             light = optics.mirror_light(image, self.instrument.rig.projector, self.instrument.projector)
-            stack = self._stack(view)
-            fine, coarse = stack.build(light * np.float32(leds * self.scene.lamp))
-            m = np.float32(optics.MARGIN)
-            loops.gather(fine, coarse, view.u + m, view.v + m, stack.level(view.sigma), view.gain, steady, out)
-            s = view.mirrored
-            if s.pixel.size:
-                level = stack.level(s.sigma)
-                loops.gather_sparse(fine, coarse, s.pixel, s.u + m, s.v + m, level, s.gain, out)
+            levels = view.stack.build(light * np.float32(leds * self.scene.lamp))
+            loops.gather(levels, view.x, view.y, view.level, view.gain, steady, out)
+            pixel, x, y, level, gain = view.more
+            loops.gather_sparse(levels, pixel, x, y, level, gain, out)
         return out.reshape(cam.lens.height, cam.lens.width)
 
     def frame(
@@ -137,24 +151,17 @@ class Renderer:
         """What each pixel centre really sees."""
         cam = self.instrument.rig.camera(camera)
         w, h = cam.lens.width, cam.lens.height
-        one = Renderer(self.scene, self.instrument, rays=1, mirrors=self._mirrors)
         xyz, uv = np.empty((h * w, 3)), np.empty((h * w, 2))
         light, shape = np.empty(h * w, bool), np.empty(h * w, np.int32)
-        for rows in one._tiles(cam, 1):
-            p = one._pixels(cam, rows)
-            origin, d = optics.look(cam.lens, cam.pose, p)
+        for k in self._tiles(cam):
+            origin, d = optics.look(cam.lens, cam.pose, _pixels(cam, np.arange(k.start, k.stop)))
             hits = trace(self.scene.shapes, origin, d)
-            k = slice(rows.start * w, rows.stop * w)
-            seen = one._to_projector(hits)
-            hit = hits.shape >= 0
-            xyz[k] = np.where(hit[:, None], hits.point, np.nan)
-            uv[k] = np.where(hit[:, None], seen[0][:, :2], np.nan)
-            light[k], shape[k] = seen[1], hits.shape
-        view = one._view(cam)
-        direct = view.gain.sum(1)
-        stray = np.bincount(view.mirrored.pixel, view.mirrored.gain, h * w)
-        with np.errstate(invalid="ignore"):
-            share = np.where(direct + stray > 0, stray / (direct + stray), 0).astype(np.float32)
+            uvz, light[k] = self._to_projector(hits)
+            hit = (hits.shape >= 0)[:, None]
+            xyz[k], uv[k], shape[k] = np.where(hit, hits.point, np.nan), np.where(hit, uvz[:, :2], np.nan), hits.shape
+        view = self._view(cam)
+        total = view.gain + np.bincount(view.more[0], view.more[4], h * w)
+        share = np.divide(view.stray, total, out=np.zeros(h * w, np.float32), where=total > 0, casting="unsafe")
         return ViewTruth(
             xyz.reshape(h, w, 3), uv.reshape(h, w, 2), light.reshape(h, w), share.reshape(h, w), shape.reshape(h, w)
         )
@@ -166,30 +173,10 @@ class Renderer:
 
     # ---------------------------------------------------------------------------------------------------- geometry
 
-    def rays_of(self, cam: Camera) -> int:
-        """Rays per pixel for a camera."""
-        return self._rays or (4 if cam.lens.width * cam.lens.height <= 1_000_000 else 1)
-
-    def _stack(self, view: _View) -> optics.LightStack:
-        used = view.sigma[view.gain > 0]
-        low, high = (float(used.min()), float(used.max())) if used.size else (1.0, 1.0)
-        if view.mirrored.sigma.size:
-            high = max(high, float(view.mirrored.sigma.max()))
-        return optics.LightStack(optics.blur_levels(low, min(high, 24.0)), self._aspect)
-
-    def _tiles(self, cam: Camera, rays: int) -> list[slice]:
-        step = max(2, TILE // (cam.lens.width * rays) // 2 * 2)
-        return [slice(r, min(r + step, cam.lens.height)) for r in range(0, cam.lens.height, step)]
-
-    def _pixels(self, cam: Camera, rows: slice) -> F64:
-        x, y = np.meshgrid(np.arange(cam.lens.width, dtype=np.float64), np.arange(rows.start, rows.stop))
-        return np.stack([x.ravel(), y.ravel()], 1)
-
-    def _channel(self, cam: Camera, pixels: F64) -> AnyArray:
-        """Index of the sensor channel of each pixel (n,): RGGB, or 0 for a mono sensor."""
-        if not self.instrument.pixel_formats[self.instrument.rig.index(cam.name)].is_bayer:
-            return np.zeros(len(pixels), np.intp)
-        return (pixels.astype(np.intp) % 2).sum(1)
+    def _tiles(self, cam: Camera) -> list[slice]:
+        """Pixel numbers in pieces of whole pairs of rows."""
+        step, n = max(2, TILE // cam.lens.width // 2 * 2) * cam.lens.width, cam.lens.width * cam.lens.height
+        return [slice(k, min(k + step, n)) for k in range(0, n, step)]
 
     def _view(self, cam: Camera) -> _View:
         if cam.name not in self._views:
@@ -197,70 +184,72 @@ class Renderer:
         return self._views[cam.name]
 
     def _make(self, cam: Camera) -> _View:
-        n, s = cam.lens.width * cam.lens.height, self.rays_of(cam)
-        u, v, sigma, gain = (np.zeros((n, s), np.float32) for _ in range(4))
-        steady, ring = np.zeros(n, np.float32), np.zeros(n, np.float32)
+        h, w = cam.lens.height, cam.lens.width
+        u, v, sigma, gain, steady, ring, stray, spread = (np.zeros(h * w, np.float32) for _ in range(8))
+        shape, light = np.empty(h * w, np.int16), np.empty(h * w, bool)
+        shadow = np.empty((self.instrument.ring.lamps, h * w), bool) if self._rays > 1 else None
         found: list[_Sparse] = []
-        offsets, weights = _quadrature(s)
-        for rows in self._tiles(cam, s):
-            pixels = self._pixels(cam, rows)
-            k = slice(rows.start * cam.lens.width, rows.stop * cam.lens.width)
-            origin, d = optics.look(cam.lens, cam.pose, pixels)
-            middle = trace(self.scene.shapes, origin, d)
-            spread = self._spread(cam, middle, origin, d)
-            channel = self._channel(cam, pixels)
-            for j in range(s):
-                if s > 1:
-                    origin, d = optics.look(cam.lens, cam.pose, pixels + spread[:, None] * offsets[j])
-                    hits = trace(self.scene.shapes, origin, d)
-                else:
-                    hits = middle
-                shaded, room = self._shade(cam, hits, d, channel)
-                u[k, j], v[k, j] = shaded.uv[:, 0], shaded.uv[:, 1]
-                sigma[k, j], gain[k, j] = shaded.sigma, shaded.gain * weights[j]
-                steady[k] += weights[j] * room
-                if self._mirrors:
-                    extra = self._mirror(cam, hits, d, channel)
-                    if extra is not None:
-                        found.append(extra._replace(pixel=extra.pixel + k.start, gain=extra.gain * weights[j]))
-            ring[k] = self._ring(cam, middle, d if s == 1 else optics.look(cam.lens, cam.pose, pixels)[1], channel, rows)
-        dark = ~((gain > 0) & np.isfinite(u))
-        for a in (u, v, sigma, gain):
-            a[dark] = 0.0
-        sparse = _Sparse(*(np.concatenate(c) for c in zip(*found, strict=True))) if found else _EMPTY
-        return _View(u, v, sigma, gain, sparse, steady, ring)
+        for k in self._tiles(cam):
+            index = np.arange(k.start, k.stop)
+            origin, d = optics.look(cam.lens, cam.pose, _pixels(cam, index))
+            rays = self._shade(cam, origin, d, index)
+            u[k], v[k], sigma[k], gain[k], steady[k] = rays.uv[:, 0], rays.uv[:, 1], rays.sigma, rays.gain, rays.room
+            shape[k], light[k] = rays.surface.hits.shape, rays.lit
+            spread[k] = self._spread(cam, rays.surface.hits, origin)
+            found.append(rays.mirrored)
+            seen = self._ring_shadows(rays.surface.hits, w)
+            ring[k] = self._ring(cam, rays.surface, d, seen, index)
+            if shadow is not None:
+                shadow[:, k] = seen
+        gain[~light] = 0.0
+        foot, rough = _footprint(u.reshape(h, w), v.reshape(h, w), gain.reshape(h, w), shape.reshape(h, w), self._aspect)
+        if self._rays > 1:
+            edges = np.flatnonzero(rough)
+            found = [f._replace(**_pick(f, ~rough[f.pixel])) for f in found]
+            gain[edges] = steady[edges] = ring[edges] = 0.0
+            offsets, weights = _quadrature(self._rays)
+            for part in np.array_split(edges, len(edges) // TILE + 1):
+                base = _pixels(cam, part)
+                for o, weight in zip(offsets, weights, strict=True):
+                    origin, d = optics.look(cam.lens, cam.pose, base + spread[part, None] * o)
+                    rays = self._shade(cam, origin, d, part)
+                    steady[part] += weight * rays.room
+                    ring[part] += weight * self._ring(cam, rays.surface, d, shadow[:, part], part)
+                    k = np.flatnonzero(rays.lit & (rays.gain > 0))
+                    direct = _Sparse(part[k], *(a.astype(np.float32) for a in (*rays.uv[k].T, rays.sigma[k], weight * rays.gain[k])))
+                    found += [direct, rays.mirrored._replace(gain=np.float32(weight) * rays.mirrored.gain)]
+                    np.add.at(stray, rays.mirrored.pixel, np.float32(weight) * rays.mirrored.gain)
+        sigma = np.sqrt(sigma**2 + (foot.ravel() * spread) ** 2)
+        more = _Sparse(*(np.concatenate(c) for c in zip(*found, strict=True)))
+        smooth = gain > 0
+        for a in (u, v):
+            a[~smooth] = 0.0
+        low = float(np.percentile(sigma[smooth], 2)) if smooth.any() else 1.0
+        high = max(float(a.max()) for a in (sigma[smooth], more.sigma, np.float32([low])) if a.size)
+        stack = optics.LightStack(optics.blur_levels(low, min(high, MOST_BLUR)), self._aspect)
+        lookups = (more.pixel, *stack.place(more.sigma, more.u, more.v), more.gain)
+        return _View(stack, *stack.place(sigma, u, v), gain, lookups, steady, ring, stray)
 
-    def _spread(self, cam: Camera, hits: Hits, origin: F64, d: F64) -> F64:
+    def _spread(self, cam: Camera, hits: Hits, origin: F64) -> F64:
         """Standard deviation (n,) in pixels of pixel area and defocus together."""
         o = self.instrument.camera
         depth = np.where(hits.shape >= 0, (hits.point - origin) @ cam.pose.R[2], o.focus_mm)
         f = 0.5 * (cam.lens.K[0, 0] + cam.lens.K[1, 1])
-        blur = optics.defocus_sigma(f, o.aperture_mm, o.focus_mm, depth)
-        return np.sqrt(1.0 / 12.0 + blur**2)
+        return np.asarray(np.sqrt(1.0 / 12.0 + optics.defocus_sigma(f, o.aperture_mm, o.focus_mm, depth) ** 2))
 
     def _to_projector(self, hits: Hits) -> tuple[F64, Bool]:
         """(u, v, depth) (n, 3) of hits on the projector plane, and whether the projector reaches them."""
         p = self.instrument.rig.projector
         uvz = optics.land(p.lens, p.pose, hits.point)
         w, h = p.plane_size
-        m = optics.MARGIN - 2
+        m = optics.MARGIN - 4
         with np.errstate(invalid="ignore"):
             ok = (hits.shape >= 0) & (uvz[:, 0] > -m) & (uvz[:, 0] < w - 1 + m) & (uvz[:, 1] > -m) & (uvz[:, 1] < h - 1 + m)
         k = np.flatnonzero(ok)
         ok[k] = lit(self.scene.shapes, hits.point[k], hits.normal[k], self._centre)
         return uvz, ok
 
-    def _irradiance(self, points: F64, normals: F64) -> tuple[F64, F64]:
-        """Projector light on surfaces facing it (n,): 1 at the focus distance, straight on; and unit vectors towards it."""
-        to = self._centre - points
-        r = np.linalg.norm(to, axis=1)
-        to = to / r[:, None]
-        axis = -to @ self.instrument.rig.projector.pose.R[2]
-        cos = np.clip(np.einsum("ij,ij->i", to, normals), 0, 1)
-        return (self._reference / r) ** 2 * np.clip(axis, 0, 1) ** self.instrument.projector.falloff * cos, to
-
-    def _surface(self, hits: Hits) -> tuple[F64, F64, F64, F64, F64]:
-        """Per hit: albedo (n, 3), roughness, mirrored share, scattering length (n,) and the normal that gloss sees."""
+    def _surface(self, cam: Camera, hits: Hits, d: F64, pixel: AnyArray) -> _Surface:
         n = len(hits.t)
         albedo, alpha, f0, scatter = np.zeros((n, 3)), np.full(n, 0.3), np.zeros(n), np.zeros(n)
         shiny = hits.normal.copy()
@@ -271,104 +260,146 @@ class Renderer:
             f, p = shape.finish, shape.local(hits.point[k])
             albedo[k], alpha[k], f0[k], scatter[k] = f.albedo(p), f.alpha, f.f0, f.scatter_mm
             if f.bumps is not None:
-                slope = f.bumps(p)
                 b = shiny[k]
-                b[:, :2] += slope[:, :2] * np.abs(b[:, 2:])
+                b[:, :2] += f.bumps(p) * np.abs(b[:, 2:])
                 shiny[k] = b / np.linalg.norm(b, axis=1, keepdims=True)
-        return albedo, alpha, f0, scatter, shiny
+        fall = np.clip(d @ cam.pose.R[2], 0, 1) ** self.instrument.camera.falloff
+        inst = self.instrument
+        colours = np.empty((3, n))
+        for j, light in enumerate((inst.projector_colour, inst.ring.colour, inst.ambient)):
+            colours[j] = fall * (albedo * self._response(cam, light, pixel)).sum(1)
+        return _Surface(hits, colours, alpha, f0, scatter, shiny)
 
-    def _falloff(self, cam: Camera, d: F64) -> F64:
-        return np.clip(d @ cam.pose.R[2], 0, 1) ** self.instrument.camera.falloff
-
-    def _colour(self, cam: Camera, colour: tuple[float, float, float]) -> F64:
-        """Response of each sensor channel (c, 3) to surface colour under a light; green (or mono) white gives 1."""
+    def _response(self, cam: Camera, colour: tuple[float, float, float], pixel: AnyArray) -> F64:
+        """Response (n, 3) of pixels' sensor sites to surface colour under a light; a green (or mono) site answers white with 1."""
         fmt = self.instrument.pixel_formats[self.instrument.rig.index(cam.name)]
         M = self.instrument.sensor.response(fmt)
-        return np.asarray(M * np.asarray(colour) / M[len(M) // 2].sum())
+        M = M * np.asarray(colour) / M[len(M) // 2].sum()
+        if not fmt.is_bayer:
+            return np.broadcast_to(M[0], (len(pixel), 3))
+        return np.asarray(M[(pixel % cam.lens.width) % 2 + (pixel // cam.lens.width) % 2])
 
-    def _shade(self, cam: Camera, hits: Hits, d: F64, channel: AnyArray) -> tuple[_Shaded, F64]:
-        """Direct projector light of each ray, and the room's steady light (n,)."""
-        uvz, visible = self._to_projector(hits)
-        albedo, alpha, f0, scatter, shiny = self._surface(hits)
-        fall = self._falloff(cam, d)
-        room_M, M = self._colour(cam, self.instrument.ambient), self._colour(cam, self.instrument.projector_colour)
-        room = fall * np.einsum("ij,ij->i", albedo, room_M[channel])
-        gain, sigma = np.zeros(len(d)), np.ones(len(d))
-        k = np.flatnonzero(visible)
-        if k.size:
-            E, to = self._irradiance(hits.point[k], hits.normal[k])
-            eye = -d[k]
-            ne = np.einsum("ij,ij->i", hits.normal[k], eye)
-            inside = (1 - optics.fresnel(f0[k], ne)) * (1 - f0[k])
-            tint = M[channel[k]]
-            cos = np.maximum(np.einsum("ij,ij->i", to, hits.normal[k]), 1e-3)
-            shine = optics.gloss(shiny[k], to, eye, alpha[k], f0[k]) / cos
-            gain[k] = fall[k] * E * (inside * np.einsum("ij,ij->i", albedo[k], tint) + shine * tint.sum(1))
-            sigma[k] = self._blur(uvz[k, 2], scatter[k] * np.sqrt(cos))
-        return _Shaded(hits, uvz[:, :2], visible, sigma, gain), room
+    def _shade(self, cam: Camera, origin: F64, d: F64, pixel: AnyArray) -> _Rays:
+        """Traces rays along `d` (n, 3) that belong to `pixel` (n,)."""
+        inst, p = self.instrument, self.instrument.rig.projector
+        surface = self._surface(cam, trace(self.scene.shapes, origin, d), d, pixel)
+        hits = surface.hits
+        uvz, light = self._to_projector(hits)
+        gain, sigma = np.zeros(len(d)), np.full(len(d), inst.projector.blur_units)
+        k = np.flatnonzero(light)
+        tint = self._response(cam, inst.projector_colour, pixel[k]).sum(1)
+        value = np.empty(len(k))
+        loops.reflect(
+            hits.point[k], hits.normal[k], surface.shiny[k], d[k], self._centre, p.pose.R[2], inst.projector.focus_mm,
+            inst.projector.falloff, surface.alpha[k], surface.f0[k], surface.colours[0, k], tint, 0.01, value,
+        )  # fmt: skip
+        gain[k] = value
+        to = self._centre - hits.point[k]
+        cos = np.einsum("ij,ij->i", to, hits.normal[k]) / np.linalg.norm(to, axis=1)
+        sigma[k] = self._blur(uvz[k, 2], surface.scatter[k] * np.sqrt(np.clip(cos, 0, 1)))
+        mirrored = self._mirror(cam, surface, d, pixel) if self._mirrors else _EMPTY
+        return _Rays(surface, uvz[:, :2], light, sigma, gain, surface.colours[2], mirrored)
 
     def _blur(self, depth: F64, spread_mm: F64) -> F64:
         """Standard deviation in plane units (along v) of projector light at `depth`, walked `spread_mm` sideways."""
         o, f = self.instrument.projector, float(self.instrument.rig.projector.lens.K[1, 1])
-        return np.sqrt(
-            o.blur_units**2 + optics.defocus_sigma(f, o.aperture_mm, o.focus_mm, depth) ** 2 + (spread_mm * f / depth) ** 2
-        )
+        defocus = optics.defocus_sigma(f, o.aperture_mm, o.focus_mm, depth)
+        return np.asarray(np.sqrt(o.blur_units**2 + defocus**2 + (spread_mm * f / depth) ** 2))
 
-    def _mirror(self, cam: Camera, hits: Hits, d: F64, channel: AnyArray) -> _Sparse | None:
+    def _mirror(self, cam: Camera, surface: _Surface, d: F64, pixel: AnyArray) -> _Sparse:
         """Fringes that a wet surface mirrors into the camera from what lies around it (the paper's case 2)."""
-        _, alpha, f0, _, shiny = self._surface(hits)
-        ne = -np.einsum("ij,ij->i", shiny, d)
-        F = np.where((f0 > 0) & (ne > 0), optics.fresnel(f0, ne), 0.0)
-        k = np.flatnonzero((F > 0.01) & (hits.shape >= 0))
+        hits, inst = surface.hits, self.instrument
+        ne = -np.einsum("ij,ij->i", surface.shiny, d)
+        out = d + 2 * ne[:, None] * surface.shiny
+        k = np.flatnonzero((surface.f0 > 0) & (ne > 0) & (np.einsum("ij,ij->i", out, hits.normal) > 0.02))
         if not k.size:
-            return None
-        n = shiny[k]
-        out = d[k] + 2 * ne[k, None] * n
-        up = np.einsum("ij,ij->i", out, hits.normal[k]) > 0.02
-        k, out, n = k[up], out[up], hits.normal[k][up]
-        second = trace(self.scene.shapes, hits.point[k] + 0.02 * n + 0.01 * out, out)
-        away = np.where(second.shape >= 0, second.t, 0.0)
-        near = (second.shape >= 0) & (away < 60.0)
-        k, away, out = k[near], away[near], out[near]
+            return _EMPTY
+        second = trace(self.scene.shapes, hits.point[k] + 0.02 * hits.normal[k] + 0.01 * out[k], out[k])
+        near = np.flatnonzero((second.shape >= 0) & (second.t < MIRROR_REACH))
+        k = k[near]
         second = Hits(*(a[near] for a in (second.shape, second.t, second.point, second.normal)))
-        uvz, visible = self._to_projector(second)
-        albedo, *_ = self._surface(second)
-        E, _ = self._irradiance(second.point, second.normal)
-        M = self._colour(cam, self.instrument.projector_colour)[channel[k]]
-        g = self._falloff(cam, d[k]) * F[k] * E * np.einsum("ij,ij->i", albedo, M)
-        keep = visible & (g > MIRROR_MIN)
-        sigma = self._blur(uvz[keep, 2], 0.5 * alpha[k[keep]] * away[keep])
-        u, v = uvz[keep, 0].astype(np.float32), uvz[keep, 1].astype(np.float32)
-        return _Sparse(k[keep], u, v, sigma.astype(np.float32), g[keep].astype(np.float32))
+        uvz, light = self._to_projector(second)
+        where = self._surface(cam, second, d[k], pixel[k])
+        value, none = np.empty(len(k)), np.zeros(len(k))
+        loops.reflect(
+            second.point, second.normal, where.shiny, out[k], self._centre, inst.rig.projector.pose.R[2], inst.projector.focus_mm,
+            inst.projector.falloff, where.alpha, none, where.colours[0], none, 0.01, value,
+        )  # fmt: skip
+        value *= optics.fresnel(surface.f0[k], ne[k]) * light
+        keep = np.flatnonzero(value > MIRROR_MIN)
+        sigma = self._blur(uvz[keep, 2], 0.5 * surface.alpha[k[keep]] * second.t[keep])
+        return _Sparse(pixel[k[keep]], *(a.astype(np.float32) for a in (*uvz[keep, :2].T, sigma, value[keep])))
 
-    def _ring(self, cam: Camera, hits: Hits, d: F64, channel: AnyArray, rows: slice) -> F64:
-        """Ring-light signal (n,) of pixel centres; shadows are traced at every second row and column, for they are soft."""
+    def _lamps(self) -> F64:
         r = self.instrument.ring
-        albedo, alpha, f0, _, shiny = self._surface(hits)
-        M = self._colour(cam, r.colour)[channel]
-        w = cam.lens.width
-        shape = (rows.stop - rows.start, w)
-        index = np.arange(shape[0] * w).reshape(shape)
-        sparse = index[::2, ::2].ravel()
-        total = np.zeros(len(d))
-        eye = -d
-        for i in range(r.lamps):
-            a = 2 * math.pi * (i + 0.5) / r.lamps
-            lamp = np.array([r.radius * math.cos(a), r.radius * math.sin(a), r.height])
-            to = lamp - hits.point
-            far = np.linalg.norm(to, axis=1)
-            to /= far[:, None]
-            cos = np.clip(np.einsum("ij,ij->i", to, hits.normal), 0, 1)
-            ok = hits.shape[sparse] >= 0
-            see = np.zeros(len(sparse))
-            see[ok] = lit(self.scene.shapes, hits.point[sparse[ok]], hits.normal[sparse[ok]], lamp)
-            shadow = np.repeat(np.repeat(see.reshape(-1, (w + 1) // 2), 2, 0), 2, 1)[: shape[0], :w].ravel()
-            shine = optics.gloss(shiny, to, eye, np.maximum(alpha, 0.18), f0)
-            total += shadow * (r.height / far) ** 2 * (cos * np.einsum("ij,ij->i", albedo, M) + shine * M.sum(1))
-        return np.where(hits.shape >= 0, self._falloff(cam, d) * r.brightness * total / r.lamps, 0.0)
+        a = 2 * math.pi * (np.arange(r.lamps) + 0.5) / r.lamps
+        return np.stack([r.radius * np.cos(a), r.radius * np.sin(a), np.full(r.lamps, r.height)], 1)
+
+    def _ring_shadows(self, hits: Hits, width: int) -> Bool:
+        """Which lamps of the ring reach whole rows of hits (lamps, n): traced at every second row and column, for it is soft."""
+        index = np.arange(len(hits.t)).reshape(-1, width)
+        few = index[::2, ::2].ravel()
+        out = np.empty((self.instrument.ring.lamps, len(hits.t)), bool)
+        ok = hits.shape[few] >= 0
+        for i, lamp in enumerate(self._lamps()):
+            see = np.zeros(len(few), bool)
+            see[ok] = lit(self.scene.shapes, hits.point[few[ok]], hits.normal[few[ok]], lamp)
+            grid = see.reshape(-1, (width + 1) // 2)
+            out[i] = np.repeat(np.repeat(grid, 2, 0), 2, 1)[: len(index), :width].ravel()
+        return out
+
+    def _ring(self, cam: Camera, surface: _Surface, d: F64, seen: Bool, pixel: AnyArray) -> F64:
+        """Ring-light signal (n,)."""
+        r, hits = self.instrument.ring, surface.hits
+        tint = self._response(cam, r.colour, pixel).sum(1)
+        total, value = np.zeros(len(d)), np.empty(len(d))
+        for lamp, reaches in zip(self._lamps(), seen, strict=True):
+            loops.reflect(
+                hits.point, hits.normal, surface.shiny, d, lamp, np.zeros(3), r.height, 0.0,
+                surface.alpha, surface.f0, surface.colours[1], tint, r.softness, value,
+            )  # fmt: skip
+            total += reaches * value
+        return r.brightness / r.lamps * np.where(hits.shape >= 0, total, 0.0)
 
 
 _EMPTY = _Sparse(np.empty(0, np.intp), *(np.empty(0, np.float32) for _ in range(4)))
+
+
+def _pixels(cam: Camera, index: AnyArray) -> F64:
+    """Pixel numbers (n,) to coordinates (n, 2)."""
+    return np.stack([index % cam.lens.width, index // cam.lens.width], 1).astype(np.float64)
+
+
+def _pick(s: _Sparse, keep: Bool) -> dict[str, AnyArray]:
+    return {name: getattr(s, name)[keep] for name in s._fields}
+
+
+def _footprint(u: F32, v: F32, gain: F32, shape: AnyArray, aspect: float) -> tuple[F32, Bool]:
+    """Projector-plane units (along v) per pixel (H, W), and where (H W,) a pixel's surroundings are not smooth.
+
+    Not smooth: another shape, shadow or light beside it, a fifth more or less gain in a like-coloured neighbour, or bent (u, v).
+    """
+    bent = np.zeros(u.shape, np.float32)
+    length = np.zeros(u.shape, np.float32)
+    rough = np.zeros(u.shape, bool)
+    for axis in (0, 1):
+        for a, scale in ((u, 1 / aspect), (v, 1.0)):
+            d = np.diff(a, axis=axis) * np.float32(scale)
+            inner, first, last = ((slice(None),) * axis + (s,) for s in (slice(1, -1), slice(0, 1), slice(-1, None)))
+            before, after = (d[(slice(None),) * axis + (s,)] for s in (slice(None, -1), slice(1, None)))
+            bent[inner] = np.fmax(bent[inner], np.abs(after - before))
+            length[inner] += 0.25 * (after + before) ** 2
+            length[first] += d[first] ** 2
+            length[last] += d[last] ** 2
+        for step in (1, 2):
+            low, high = ((slice(None),) * axis + (s,) for s in (slice(None, -step), slice(step, None)))
+            other = (shape[low] != shape[high]) | ((gain[low] > 0) != (gain[high] > 0))
+            if step == 2:
+                other |= np.abs(gain[low] - gain[high]) > 0.2 * np.maximum(gain[low], gain[high])
+            rough[low] |= other
+            rough[high] |= other
+    rough |= ~(bent < MOST_BEND) & (gain > 0)
+    return np.sqrt(0.5 * np.where(rough, 0, length)), rough.ravel()
 
 
 def _quadrature(rays: int) -> tuple[F64, F64]:

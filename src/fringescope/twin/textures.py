@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from fringescope.twin import loops
 from fringescope.types import F32, F64, AnyArray
 
 Colour = tuple[float, float, float]
@@ -48,15 +49,8 @@ class Raster:
 
     def __call__(self, points: F64) -> F64:
         """Bilinear lookup at own coordinates (n, 3), (n, k)."""
-        h, w = self.values.shape[:2]
-        x = np.clip((points[:, 0] - self.origin[0]) / self.step, 0, w - 1.001)
-        y = np.clip((points[:, 1] - self.origin[1]) / self.step, 0, h - 1.001)
-        i, j = x.astype(np.intp), y.astype(np.intp)
-        fx, fy = (x - i)[:, None], (y - j)[:, None]
-        v = self.values
-        top = v[j, i] * (1 - fx) + v[j, i + 1] * fx
-        low = v[j + 1, i] * (1 - fx) + v[j + 1, i + 1] * fx
-        out: F64 = top * (1 - fy) + low * fy
+        out = np.empty((len(points), self.values.shape[2]))
+        loops.bilinear(self.values, *self.origin, self.step, np.ascontiguousarray(points), out)
         return out
 
 
