@@ -2,5 +2,6 @@
 
 from fringescope.export.glb import encode_picture, glb_bytes, write_glb
 from fringescope.export.ply import read_ply, write_ply
+from fringescope.export.viewer import viewer_page
 
-__all__ = ["encode_picture", "glb_bytes", "read_ply", "write_glb", "write_ply"]
+__all__ = ["encode_picture", "glb_bytes", "read_ply", "viewer_page", "write_glb", "write_ply"]

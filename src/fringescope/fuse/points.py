@@ -16,6 +16,7 @@ from fringescope.kernels import surface as k
 from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Cloud, Grid, Photo, Rig
 
+_SMOOTH = (15, 15)  # cells over which a view's weight is averaged before ownership is settled
 _BAND = 256  # rows worked on at a time, which bounds the memory of the sums
 
 
@@ -201,7 +202,7 @@ def _ownership(grids: Sequence[Grid], weights: Sequence[F32], spacings: Sequence
     for i, (ab, w) in enumerate(zip(coordinates, weights, strict=True)):
         total, count = np.zeros((rows, cols)), np.zeros((rows, cols), np.int32)
         k.bin_weights(ab, w, low, cell, total, count)
-        smooth = cv2.blur(total, (9, 9)) / np.maximum(cv2.blur(count.astype(np.float64), (9, 9)), 1e-9)
+        smooth = cv2.blur(total, _SMOOTH) / np.maximum(cv2.blur(count.astype(np.float64), _SMOOTH), 1e-9)
         score = np.where(count > 0, smooth, 0.0).astype(np.float32)
         better = score > best
         best[better], owner[better] = score[better], i
