@@ -1,7 +1,7 @@
 """Plays patterns, collects the frames of each view, and proves that frame n is pattern n.
 
-Cameras are armed before the projector fires. Proof: counts, contiguous block numbers, complete buffers, one period between exposures,
-no frame too many, and for every N-step set a misfit that no single frame explains. Any failure is an
+Cameras are armed before the projector fires. Proof: counts, contiguous block numbers, complete buffers, one period
+between exposures, no frame too many, and for every N-step set a misfit that no single frame explains. Any failure is an
 IncompleteShotError that names the frames; nothing is ever interpolated.
 """
 
@@ -26,7 +26,18 @@ from fringescope.devices.base import (
 )
 from fringescope.errors import CaptureError, DeviceTimeoutError, IncompleteShotError, RejectedError
 from fringescope.settings import CaptureSettings
-from fringescope.types import F64, U8, AnyArray, FrameKey, FringeSet, PatternPlan, Role, ViewInput, ViewPlan
+from fringescope.types import (
+    F64,
+    U8,
+    AnyArray,
+    FrameKey,
+    FringeSet,
+    PatternPlan,
+    PixelFormat,
+    Role,
+    ViewInput,
+    ViewPlan,
+)
 
 _SAMPLES = 40_000  #: pixels at which a set's misfit is looked at
 
@@ -35,7 +46,8 @@ def timing(projector: Projector, cameras: Sequence[Camera], s: CaptureSettings |
     """The shortest period at which every camera sees each pattern whole and alone.
 
     A rolling shutter exposes all rows together only between readouts, so its period is exposure plus readout; a global
-    one may read while the next pattern is shown. Raises RejectedError if the projector cannot show a pattern that short.
+    one may read while the next pattern is shown. Raises RejectedError if the projector cannot show a pattern that
+    short.
     """
     s = s or CaptureSettings()
     if s.exposure_us < projector.info.min_exposure_us:
@@ -61,9 +73,10 @@ def collect(
 ) -> tuple[ViewInput, ...]:
     """Records every view of a plan with its own patterns, then the ring-light pictures; all frames are kept.
 
-    `images`: per view of the plan, its frames in the plan's order as the device shows them. `cameras` in the order of the views.
-    A view whose proof fails is played again, at most `retries` times. Returns one ViewInput per view, `color` None
-    without a light. Raises IncompleteShotError, DeviceLostError, RejectedError, and CaptureError if images and plan differ.
+    `images`: per view of the plan, its frames in the plan's order as the device shows them. `cameras` in the order of
+    the views. A view whose proof fails is played again, at most `retries` times. Returns one ViewInput per view,
+    `color` None without a light. Raises IncompleteShotError, DeviceLostError, RejectedError, and CaptureError if images
+    and plan differ.
     """
     s = settings or CaptureSettings()
     _check(cameras, images, plan)
@@ -98,11 +111,15 @@ def stream(
     shown = list(images)
     keys = view.keys
     if tuple(k for k, _ in shown) != keys:
-        raise CaptureError(f"view '{view.camera}': {len(shown)} images that are not the plan's {len(keys)} frames in order")
+        raise CaptureError(
+            f"view '{view.camera}': {len(shown)} images that are not the plan's {len(keys)} frames in order"
+        )
     camera.configure(CameraSettings(view.pixel_format, s.exposure_us + s.margin_us))
     exposure = timing(projector, [camera], s)
     loaded = projector.load(Shot(tuple(PatternRef(i, label(k)) for k, i in shown), exposure))
-    proof = _Proof(view, camera, exposure.period_us * 1000 if loaded.exposure == exposure else loaded.exposure.period_us * 1000, s)
+    proof = _Proof(
+        view, camera, exposure.period_us * 1000 if loaded.exposure == exposure else loaded.exposure.period_us * 1000, s
+    )
     with camera.arm(len(keys), Trigger(timeout_s=s.timeout_s)) as acquisition, projector.fire(loaded) as running:
         for key, frame in zip(keys, _expect(acquisition, keys, camera), strict=True):
             proof.add(key, frame)
@@ -115,14 +132,16 @@ def photograph(
     projector: Projector,
     cameras: Sequence[Camera],
     light: Light,
-    pixel_formats: Sequence[object] | None = None,
+    pixel_formats: Sequence[PixelFormat] | None = None,
     settings: CaptureSettings | None = None,
 ) -> tuple[AnyArray, ...]:
-    """The ring-light picture of every camera at once, the projector dark: raw frames (H, W). The light is off afterwards."""
+    """The ring-light picture of every camera at once, the projector dark: raw frames (H, W). The light is off
+    afterwards.
+    """
     s = settings or CaptureSettings()
     formats = list(pixel_formats) if pixel_formats is not None else [c.settings.pixel_format for c in cameras]
     for c, f in zip(cameras, formats, strict=True):
-        c.configure(CameraSettings(f, s.exposure_us + s.margin_us))  # type: ignore[arg-type]
+        c.configure(CameraSettings(f, s.exposure_us + s.margin_us))
     dark = np.zeros((projector.info.height, projector.info.width), dtype=np.uint8)
     loaded = projector.load(Shot((PatternRef(dark, "ring light"),), timing(projector, cameras, s)))
     light.set(1.0)
@@ -141,8 +160,8 @@ def photograph(
         for a in armed:
             a.cancel()
         light.set(0.0)
-    for c, f in zip(cameras, frames, strict=True):
-        if not f.complete:
+    for c, frame in zip(cameras, frames, strict=True):
+        if not frame.complete:
             raise IncompleteShotError(f"{c.info.uri}: the ring-light picture came incomplete; take it again")
     return tuple(f.pixels for f in frames)
 
@@ -197,7 +216,9 @@ class _Proof:
         if frame.block_id != first.block_id + n:
             gap = frame.block_id - first.block_id - n
             names = ", ".join(label(k) for k in self._view.keys[n : n + max(gap, 0)])
-            raise self._fail(f"frame lost: {names}" if gap > 0 else f"block {frame.block_id} came twice or out of order")
+            raise self._fail(
+                f"frame lost: {names}" if gap > 0 else f"block {frame.block_id} came twice or out of order"
+            )
         if not frame.complete:
             raise self._fail(f"{label(key)} came incomplete")
         if frame.device_ns is not None and first.device_ns is not None:
@@ -209,7 +230,8 @@ class _Proof:
         expected = (c.height, c.width) if self._camera.settings.roi is None else self._camera.settings.roi[:1:-1]
         if frame.pixels.shape[:2] != expected or frame.pixels.dtype != self._view.pixel_format.dtype:
             raise self._fail(
-                f"{label(key)} is {frame.pixels.shape} {frame.pixels.dtype}; needed {expected} {self._view.pixel_format.dtype}"
+                f"{label(key)} is {frame.pixels.shape} {frame.pixels.dtype}; "
+                f"needed {expected} {self._view.pixel_format.dtype}"
             )
         spec = self._view.sets[key.set_index]
         if isinstance(spec, FringeSet) and key.role is Role.STEP and spec.steps >= 4:
@@ -248,8 +270,9 @@ def _thin(pixels: AnyArray) -> AnyArray:
 def wrong_frames(samples: AnyArray, full_scale: float) -> tuple[float, F64]:
     """How much of each frame's misfit is not noise: what neighbouring pixels share.
 
-    `samples` (N, m, 2): pairs of neighbouring pixels in the N frames of a set, N >= 4. Returns the typical modulation in codes (0: nothing
-    lit) and, per frame, the shared misfit in codes squared (N,) after mean and first harmonic are fitted.
+    `samples` (N, m, 2): pairs of neighbouring pixels in the N frames of a set, N >= 4. Returns the typical modulation
+    in codes (0: nothing lit) and, per frame, the shared misfit in codes squared (N,) after mean and first harmonic are
+    fitted.
     """
     x = samples.astype(np.float64)
     n = len(x)

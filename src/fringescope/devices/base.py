@@ -1,8 +1,8 @@
 """What a projector, a camera and a light are to the rest of the code, whoever made them.
 
 The public verb checks, the hidden hook (`_load`, `_arm` ..) does the vendor's few lines: a driver subclasses `Camera`,
-`Projector` or `Light` and fills the hooks in. Every device is a context manager; `close` and `cancel` may be called twice
-and from any thread; errors are those of `errors.py`. Times are microseconds and nanoseconds, as the names say.
+`Projector` or `Light` and fills the hooks in. Every device is a context manager; `close` and `cancel` may be called
+twice and from any thread; errors are those of `errors.py`. Times are microseconds and nanoseconds, as the names say.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ DARK_GAP_US = 230  #: a DLPC350 needs this much dark time after an exposure, or 
 
 @dataclass(frozen=True)
 class Exposure:
-    """How long each pattern is lit, and from one pattern's start to the next. Raises RejectedError for an impossible pair."""
+    """How long each pattern is lit, and from one pattern's start to the next. Raises RejectedError for an impossible
+    pair.
+    """
 
     duration_us: int
     period_us: int
@@ -148,8 +150,8 @@ class Trigger:
 class Frame:
     """One frame as the device sent it.
 
-    `block_id` counts the device's exposures, contiguous unless something was lost. `device_ns`: start of exposure on the device's
-    clock, None where it has none. `host_ns`: arrival. `complete`: False if part of the buffer never came.
+    `block_id` counts the device's exposures, contiguous unless something was lost. `device_ns`: start of exposure on
+    the device's clock, None where it has none. `host_ns`: arrival. `complete`: False if part of the buffer never came.
     """
 
     pixels: AnyArray
@@ -196,7 +198,7 @@ class LoadedShot:
 # ---------------------------------------------------------------------------------------------------------- devices
 
 
-class Device(ABC):
+class Device:
     """Opened on construction, closed once; `with device:` closes it."""
 
     def __init__(self) -> None:
@@ -234,8 +236,8 @@ class Device(ABC):
 class Acquisition(ABC):
     """Frames on their way from an armed camera: iterate to get them, in the order in which they arrive.
 
-    Iteration ends after the frames asked for, or after `cancel`. It raises DeviceTimeoutError if a frame does not come in time
-    and DeviceLostError if the camera is gone.
+    Iteration ends after the frames asked for, or after `cancel`. It raises DeviceTimeoutError if a frame does not come
+    in time and DeviceLostError if the camera is gone.
     """
 
     @abstractmethod
@@ -261,7 +263,7 @@ class Acquisition(ABC):
         self.cancel()
 
 
-class Camera(Device):
+class Camera(Device, ABC):
     """A camera that records on an edge."""
 
     @property
@@ -292,7 +294,12 @@ class Camera(Device):
             raise RejectedError(f"{i.uri}: gain {settings.gain}; needed a positive number")
         r = settings.roi
         if r is not None and (
-            r.left < 0 or r.top < 0 or r.width < 1 or r.height < 1 or r.left + r.width > i.width or r.top + r.height > i.height
+            r.left < 0
+            or r.top < 0
+            or r.width < 1
+            or r.height < 1
+            or r.left + r.width > i.width
+            or r.top + r.height > i.height
         ):
             raise RejectedError(f"{i.uri}: region {tuple(r)}; it does not fit the sensor of {i.width} x {i.height}")
         if r is not None and (r.left % 2 or r.top % 2):
@@ -341,7 +348,7 @@ class Running(ABC):
         self.cancel()
 
 
-class Projector(Device):
+class Projector(Device, ABC):
     """A projector that plays patterns and emits an edge with each."""
 
     @property
@@ -364,7 +371,9 @@ class Projector(Device):
         if len(shot.patterns) > i.max_patterns:
             raise RejectedError(f"{i.uri}: {len(shot.patterns)} patterns; it holds {i.max_patterns}")
         if shot.exposure.duration_us < i.min_exposure_us:
-            raise RejectedError(f"{i.uri}: exposure {shot.exposure.duration_us} us; needed at least {i.min_exposure_us}")
+            raise RejectedError(
+                f"{i.uri}: exposure {shot.exposure.duration_us} us; needed at least {i.min_exposure_us}"
+            )
         return self._load(shot)
 
     def fire(self, loaded: LoadedShot) -> Running:
@@ -381,7 +390,7 @@ class Projector(Device):
         """Hook."""
 
 
-class Light(Device):
+class Light(Device, ABC):
     """A light of variable level, such as the ring light."""
 
     @property

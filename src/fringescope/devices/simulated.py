@@ -1,7 +1,7 @@
 """The simulated instrument: projector, cameras and ring light of one world, on one virtual clock and trigger line.
 
-A camera records what the projector shows and the ring light gives at the moment of the edge. Time is virtual: nothing waits
-for the exposure to pass. Faults can be injected to see that they are found.
+A camera records what the projector shows and the ring light gives at the moment of the edge. Time is virtual: nothing
+waits for the exposure to pass. Faults can be injected to see that they are found.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fringescope.devices import base
-from fringescope.errors import DeviceError, DeviceLostError, DeviceTimeoutError, RejectedError, UsageError
+from fringescope.errors import DeviceLostError, DeviceTimeoutError, RejectedError, UsageError
 from fringescope.twin import presets, render, scene
 from fringescope.types import U8, AnyArray, PixelFormat, Rig
 
@@ -27,8 +27,8 @@ class Faults:
     """What goes wrong, per camera name: numbers of the edges (from 0, since the camera was armed) that it strikes.
 
     `drop`: exposed, but the frame is lost on its way. `miss`: the edge is not seen. `late`: the exposure starts half a
-    period late. `corrupt`: part of the buffer never comes. `lost`: the camera vanishes. `repeat`: edges at which the projector
-    shows the pattern before once more.
+    period late. `corrupt`: part of the buffer never comes. `lost`: the camera vanishes. `repeat`: edges at which the
+    projector shows the pattern before once more.
     """
 
     drop: Mapping[str, frozenset[int]] = field(default_factory=dict)
@@ -107,10 +107,19 @@ class World:
         """The frame that `camera` exposes at an edge; `key` seeds its noise together with the world's seed."""
         index = self.instrument.rig.index(camera)
         rng = np.random.default_rng([self.seed, 77, index, key]) if self.noise else None
-        lit = min(edge.lit_us, settings.exposure_us) / settings.exposure_us  # the projector is dark outside its exposure
+        lit = (
+            min(edge.lit_us, settings.exposure_us) / settings.exposure_us
+        )  # the projector is dark outside its exposure
         with self._render_lock:
             full = self.renderer.frame(
-                camera, edge.image, rng, settings.exposure_us, edge.ring, settings.gain, edge.leds * lit, settings.pixel_format
+                camera,
+                edge.image,
+                rng,
+                settings.exposure_us,
+                edge.ring,
+                settings.gain,
+                edge.leds * lit,
+                settings.pixel_format,
             )
         r = settings.roi
         return full if r is None else full[r.top : r.top + r.height, r.left : r.left + r.width]
@@ -160,7 +169,9 @@ class _SimulatedRunning(base.Running):
             shown = shot.patterns[k - 1] if k and k in self._world.faults.repeat else p
             at = self._world.advance(period)
             self._edges.append(at)
-            self._world.raise_edge(_Edge(k, at, period, shown.image, leds, self._loaded.exposure.duration_us, self._world.ring))
+            self._world.raise_edge(
+                _Edge(k, at, period, shown.image, leds, self._loaded.exposure.duration_us, self._world.ring)
+            )
 
     def wait(self, timeout_s: float) -> None:
         """See `base.Running`."""
@@ -251,9 +262,13 @@ class _SimulatedAcquisition(base.Acquisition):
     def trigger(self) -> None:
         """See `base.Acquisition`."""
         if self._trigger.source is not base.TriggerSource.SOFTWARE:
-            raise RejectedError(f"{self._camera.info.uri}: armed for the line; a software trigger needs TriggerSource.SOFTWARE")
+            raise RejectedError(
+                f"{self._camera.info.uri}: armed for the line; a software trigger needs TriggerSource.SOFTWARE"
+            )
         period = self._settings.exposure_us * 1000
-        self.edge(_Edge(0, self._world.advance(period), period, None, 0.0, self._settings.exposure_us, self._world.ring))
+        self.edge(
+            _Edge(0, self._world.advance(period), period, None, 0.0, self._settings.exposure_us, self._world.ring)
+        )
 
     def __iter__(self) -> Iterator[base.Frame]:
         uri, f, name = self._camera.info.uri, self._world.faults, self._camera.name
@@ -274,7 +289,8 @@ class _SimulatedAcquisition(base.Acquisition):
             return self._queue.get(timeout=timeout_s)
         except queue.Empty:
             raise DeviceTimeoutError(
-                f"{self._camera.info.uri}: no frame {self._taken + 1} of {self._n} in {timeout_s} s; is the trigger connected?"
+                f"{self._camera.info.uri}: no frame {self._taken + 1} of {self._n} in {timeout_s} s; "
+                "is the trigger connected?"
             ) from None
 
     def _frame(self, edge: _Edge, k: int, block: int) -> base.Frame:
@@ -288,7 +304,8 @@ class _SimulatedAcquisition(base.Acquisition):
         return base.Frame(pixels, self._settings.pixel_format, block, at, time.monotonic_ns(), complete, chunks)
 
     def surplus(self, wait_s: float) -> int:
-        """See `base.Acquisition`. Virtual time: there is nothing to wait for."""
+        """See `base.Acquisition`. Virtual time: `wait_s` need not pass."""
+        del wait_s
         n = 0
         while True:
             try:
@@ -333,14 +350,23 @@ class SimulatedLight(base.Light):
 
 
 def parse(uri: str) -> World:
-    """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4`; a fragment is ignored.
+    """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4`; a fragment is
+    ignored.
 
     Raises UsageError for a name or option that there is not.
     """
     u = urllib.parse.urlsplit(uri)
     name = u.path.strip("/")
-    known = {"scale": 0.125, "seed": 0, "lift": 0.0, "pose": 0, "board": "checkerboard", "noise": 1, "rays": 0}
-    options: dict[str, float | int | str] = dict(known)
+    known: dict[str, float | int | str] = {
+        "scale": 0.125,
+        "seed": 0,
+        "lift": 0.0,
+        "pose": 0,
+        "board": "checkerboard",
+        "noise": 1,
+        "rays": 0,
+    }
+    options = dict(known)
     for key, text in urllib.parse.parse_qsl(u.query, keep_blank_values=True):
         if key not in known:
             raise UsageError(f"{uri}: unknown option '{key}'; there are {', '.join(known)}")
@@ -351,9 +377,7 @@ def parse(uri: str) -> World:
     if u.scheme != "sim" or not u.netloc or not name:
         raise UsageError(f"{uri}: needed sim://PRESET/SCENE, for example sim://paper/tissue-domed?scale=0.125")
     instrument = presets.instrument(u.netloc, float(options["scale"]))
-    view = scene.make(
-        name, int(options["seed"]), float(options["lift"]), int(options["pose"]), str(options["board"])
-    )
+    view = scene.make(name, int(options["seed"]), float(options["lift"]), int(options["pose"]), str(options["board"]))
     return World(view, instrument, int(options["seed"]), bool(options["noise"]), rays=int(options["rays"]) or None)
 
 
@@ -376,16 +400,3 @@ def station(world: World, uri: str = "sim://") -> SimulatedStation:
     return SimulatedStation(
         SimulatedProjector(world, f"{stem}#projector"), cameras, SimulatedLight(world, f"{stem}#light"), world
     )
-
-
-def device(world: World, uri: str) -> base.Device:
-    """The device of a world that the fragment of `uri` names: projector, light, or a camera of the rig."""
-    name = urllib.parse.urlsplit(uri).fragment
-    if name == "projector":
-        return SimulatedProjector(world, uri)
-    if name == "light":
-        return SimulatedLight(world, uri)
-    if name not in [c.name for c in world.instrument.rig.cameras]:
-        have = ", ".join(["projector", "light", *(c.name for c in world.instrument.rig.cameras)])
-        raise DeviceError(f"{uri}: no device '{name}'; this instrument has {have}")
-    return SimulatedCamera(world, name, uri)

@@ -75,7 +75,9 @@ def charuco(
     n = words.markerSize + 2
     white = [(r, c) for r in range(squares[1]) for c in range(squares[0]) if (r + c) % 2 == 1]
     if len(white) > len(words.bytesList):
-        raise UsageError(f"{dictionary} has {len(words.bytesList)} markers; a {squares[0]} x {squares[1]} board needs {len(white)}")
+        raise UsageError(
+            f"{dictionary} has {len(words.bytesList)} markers; a {squares[0]} x {squares[1]} board needs {len(white)}"
+        )
     markers = tuple((r, c, np.asarray(cv2.aruco.generateImageMarker(words, k, n))) for k, (r, c) in enumerate(white))
     spec = {
         "pattern": "charuco",

@@ -1,4 +1,4 @@
-"""Light from mirror to surface and from surface to sensor: lattice, defocus, gloss, and the sensor in physical units."""
+"""Light from mirror to surface and from surface to sensor: lattice, defocus, and the sensor in physical units."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ def mirror_light(image: U8, projector: Projector, optics: ProjectorOptics) -> F3
     """
     if image.shape != (projector.height, projector.width) or image.dtype != np.uint8:
         raise UsageError(
-            f"an image of {image.shape} {image.dtype}; the projector shows ({projector.height}, {projector.width}) uint8"
+            f"an image of {image.shape} {image.dtype}; "
+            f"the projector shows ({projector.height}, {projector.width}) uint8"
         )
     table = (np.arange(256) / 255.0) ** optics.gamma
     table = ((table + 1.0 / optics.contrast) / (1.0 + 1.0 / optics.contrast)).astype(np.float32)
@@ -89,7 +90,8 @@ def mirror_light(image: U8, projector: Projector, optics: ProjectorOptics) -> F3
 
 
 class LightStack:
-    """One pattern at several degrees of blur, sampled every `step` units of the projector plane (1, or 2 where all is blurred).
+    """One pattern at several degrees of blur, sampled every `step` units of the projector plane (1, or 2 where all is
+    blurred).
 
     `sigmas` (L,): standard deviations in plane units along v, growing; `aspect` = fx / fy of the projector.
     """
@@ -126,7 +128,9 @@ class LightStack:
 
 
 def blur_levels(smallest: float, largest: float) -> F64:
-    """Standard deviations of a light stack that covers the span: a ratio of at most 1.75 from level to level, at least two."""
+    """Standard deviations of a light stack that covers the span: a ratio of at most 1.75 from level to level, at least
+    two.
+    """
     low = max(smallest, 0.4)
     high = max(largest, 1.2 * low)
     n = max(2, math.ceil(math.log(high / low) / math.log(1.75)) + 1)
@@ -145,7 +149,9 @@ def _taps(sigma_v: float, sigma_u: float) -> F32:
 
 
 def defocus_sigma(focal_units: float, aperture_mm: float, focus_mm: float, depth: AnyArray) -> AnyArray:
-    """Standard deviation, in units of `focal_units`, of the blur disc of a thin lens at `depth` mm: a quarter of its diameter."""
+    """Standard deviation, in units of `focal_units`, of the blur disc of a thin lens at `depth` mm: a quarter of its
+    diameter.
+    """
     return 0.25 * focal_units * aperture_mm * np.abs(1.0 / focus_mm - 1.0 / depth)
 
 
@@ -164,8 +170,8 @@ def fresnel(f0: AnyArray, cosine: AnyArray) -> AnyArray:
 class Sensor:
     """A sensor in physical units; the defaults are those of an IMX183.
 
-    `full_well` and `read_noise` in electrons. At gain 1 the full well is the largest code. `offset_share`: black level as a share
-    of the largest code. `filters` (3, 3): response of R, G, B sites to red, green, blue light.
+    `full_well` and `read_noise` in electrons. At gain 1 the full well is the largest code. `offset_share`: black level
+    as a share of the largest code. `filters` (3, 3): response of R, G, B sites to red, green, blue light.
     """
 
     full_well: float = 15000.0
@@ -193,7 +199,9 @@ class Sensor:
 
 @dataclass(frozen=True)
 class CameraOptics:
-    """Aperture (entrance pupil, mm), focus distance (mm), pixel pitch (mm) and how light drops off axis (cosine's exponent)."""
+    """Aperture (entrance pupil, mm), focus distance (mm), pixel pitch (mm) and how light drops off axis (cosine's
+    exponent).
+    """
 
     focus_mm: float = 592.0
     aperture_mm: float = 4.5

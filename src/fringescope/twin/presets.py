@@ -81,7 +81,9 @@ def look_at(position: tuple[float, float, float], target: tuple[float, float, fl
 
 
 def scaled(lens: Lens, scale: float) -> Lens:
-    """The same lens before a sensor of `scale` times as many, larger pixels each way; pixel (0, 0) keeps its outer corner."""
+    """The same lens before a sensor of `scale` times as many, larger pixels each way; pixel (0, 0) keeps its outer
+    corner.
+    """
     w, h = round(lens.width * scale), round(lens.height * scale)
     if w < 8 or h < 8:
         raise UsageError(f"scale {scale} leaves {w} x {h} pixels; needed at least 8 x 8")
@@ -95,7 +97,7 @@ def scaled(lens: Lens, scale: float) -> Lens:
 
 
 def dlp4500(layout: Layout = Layout.DIAMOND) -> Projector:
-    """A DLP4500 at (0, 0, WORKING_HEIGHT), looking down: 10 x 6 cm at the working plane, with a real lens' distortion."""
+    """A DLP4500 at WORKING_HEIGHT, looking down: 10 x 6 cm at the working plane, with a real lens' distortion."""
     f = 9120.0
     pose = look_at((0.9, -1.9, WORKING_HEIGHT), (0.4, -0.3, 0.0), roll=0.002)
     d = np.array([-0.051, 0.115, 2.6e-5, 4.5e-4, 0.0])
@@ -107,7 +109,8 @@ def dlp4500(layout: Layout = Layout.DIAMOND) -> Projector:
 
 
 def camera_around(name: str, azimuth_deg: float, number: int, scale: float, pitch: float = 1.0) -> Camera:
-    """A camera BASELINE from the projector's axis at an azimuth, aimed at the working point with a mount's small errors.
+    """A camera BASELINE from the projector's axis at an azimuth, aimed at the working point with a mount's small
+    errors.
 
     `pitch`: pixel size in units of 2.4 um.
     """
@@ -144,4 +147,6 @@ def instrument(preset: str = "paper", scale: float = 1.0, layout: Layout = Layou
     cameras = tuple(camera_around(f"camera{i + 1}", a, i, scale) for i, a in enumerate(around[preset]))
     volume = Volume(np.zeros(3), np.eye(3), np.array([52.0, 33.0, 24.0]))
     kind = PixelFormat.MONO12 if preset == "single" else PixelFormat.BAYER_RG8
-    return Instrument(Rig(dlp4500(layout), cameras, volume), (kind,) * len(cameras), readout_us=max(1, round(55000 * scale)))
+    return Instrument(
+        Rig(dlp4500(layout), cameras, volume), (kind,) * len(cameras), readout_us=max(1, round(55000 * scale))
+    )

@@ -1,8 +1,9 @@
 """Pictures of a scene: geometry once per camera, then every pattern is a lookup of light.
 
-A pixel's signal is a sum over its rays of gain times projector light at the ray's (u, v), plus steady light. On smooth surfaces one ray serves, its light
-blurred by the pixel's footprint; at edges several rays sit where their second moments equal those of the pixel's
-area and the camera's defocus disc together. Either way blur is symmetric and moves no phase.
+A pixel's signal is a sum over its rays of gain times projector light at the ray's (u, v), plus steady light. On smooth
+surfaces one ray serves, its light blurred by the pixel's footprint; at edges several rays sit where their second
+moments equal those of the pixel's area and the camera's defocus disc together. Either way blur is symmetric and moves
+no phase.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ MOST_BEND = 0.3  #: plane units; second difference of (u, v) up to which a pixel
 class ViewTruth:
     """What every pixel centre of a camera sees: arrays (H, W).
 
-    `xyz` (H, W, 3) world mm and `uv` (H, W, 2) projector plane, NaN where nothing is hit; `lit`: the projector reaches the
-    point; `mirrored`: share of the pixel's projector light that came by way of another surface; `shape`: index or -1.
+    `xyz` (H, W, 3) world mm and `uv` (H, W, 2) projector plane, NaN where nothing is hit; `lit`: the projector reaches
+    the point; `mirrored`: share of the pixel's projector light that came by way of another surface; `shape`: index or
+    -1.
     """
 
     xyz: F64
@@ -53,7 +55,7 @@ class _Sparse(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """What rays (n,) found: hits, sensor response to body colour (projector's, ring's, room's light), film, scattering."""
+    """What rays (n,) found: hits, response to body colour (projector's, ring's, room's light), film, scattering."""
 
     hits: Hits
     colours: F64  #: (3, n)
@@ -77,7 +79,9 @@ class _Rays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Geometry of one camera: per pixel where it looks (columns, rows and levels of the light stack), gain, steady and ring light."""
+    """Geometry of one camera: per pixel where it looks (columns, rows and levels of the light stack), gain, steady and
+    ring light.
+    """
 
     stack: optics.LightStack
     x: F32
@@ -93,8 +97,8 @@ class _View:
 class Renderer:
     """Renders one scene through one instrument; keeps each camera's geometry once it has been needed.
 
-    Where a pixel's surroundings are smooth, one ray serves and its footprint is blur; at edges of shape, shadow or colour `rays` (1, 4 or 9)
-    are traced. `mirrors`: whether wet surfaces mirror what lies around them.
+    Where a pixel's surroundings are smooth, one ray serves and its footprint is blur; at edges of shape, shadow or
+    colour `rays` (1, 4 or 9) are traced. `mirrors`: whether wet surfaces mirror what lies around them.
     """
 
     def __init__(self, scene: Scene, instrument: Instrument, rays: int | None = None, mirrors: bool = True) -> None:
@@ -187,7 +191,7 @@ class Renderer:
         h, w = cam.lens.height, cam.lens.width
         u, v, sigma, gain, steady, ring, stray, spread = (np.zeros(h * w, np.float32) for _ in range(8))
         shape, light = np.empty(h * w, np.int16), np.empty(h * w, bool)
-        shadow = np.empty((self.instrument.ring.lamps, h * w), bool) if self._rays > 1 else None
+        shadow = np.empty((self.instrument.ring.lamps, h * w), bool)
         found: list[_Sparse] = []
         for k in self._tiles(cam):
             index = np.arange(k.start, k.stop)
@@ -199,10 +203,11 @@ class Renderer:
             found.append(rays.mirrored)
             seen = self._ring_shadows(rays.surface.hits, w)
             ring[k] = self._ring(cam, rays.surface, d, seen, index)
-            if shadow is not None:
-                shadow[:, k] = seen
+            shadow[:, k] = seen
         gain[~light] = 0.0
-        foot, rough = _footprint(u.reshape(h, w), v.reshape(h, w), gain.reshape(h, w), shape.reshape(h, w), self._aspect)
+        foot, rough = _footprint(
+            u.reshape(h, w), v.reshape(h, w), gain.reshape(h, w), shape.reshape(h, w), self._aspect
+        )
         if self._rays > 1:
             edges = np.flatnonzero(rough)
             found = [f._replace(**_pick(f, ~rough[f.pixel])) for f in found]
@@ -215,8 +220,9 @@ class Renderer:
                     rays = self._shade(cam, origin, d, part)
                     steady[part] += weight * rays.room
                     ring[part] += weight * self._ring(cam, rays.surface, d, shadow[:, part], part)
-                    k = np.flatnonzero(rays.lit & (rays.gain > 0))
-                    direct = _Sparse(part[k], *(a.astype(np.float32) for a in (*rays.uv[k].T, rays.sigma[k], weight * rays.gain[k])))
+                    on = np.flatnonzero(rays.lit & (rays.gain > 0))
+                    numbers = (*rays.uv[on].T, rays.sigma[on], weight * rays.gain[on])
+                    direct = _Sparse(part[on], *(a.astype(np.float32) for a in numbers))
                     found += [direct, rays.mirrored._replace(gain=np.float32(weight) * rays.mirrored.gain)]
                     np.add.at(stray, rays.mirrored.pixel, np.float32(weight) * rays.mirrored.gain)
         sigma = np.sqrt(sigma**2 + (foot.ravel() * spread) ** 2)
@@ -225,7 +231,7 @@ class Renderer:
         for a in (u, v):
             a[~smooth] = 0.0
         low = float(np.percentile(sigma[smooth], 2)) if smooth.any() else 1.0
-        high = max(float(a.max()) for a in (sigma[smooth], more.sigma, np.float32([low])) if a.size)
+        high = max([low, *(float(a.max()) for a in (sigma[smooth], more.sigma) if a.size)])
         stack = optics.LightStack(optics.blur_levels(low, min(high, MOST_BLUR)), self._aspect)
         lookups = (more.pixel, *stack.place(more.sigma, more.u, more.v), more.gain)
         return _View(stack, *stack.place(sigma, u, v), gain, lookups, steady, ring, stray)
@@ -244,7 +250,8 @@ class Renderer:
         w, h = p.plane_size
         m = optics.MARGIN - 4
         with np.errstate(invalid="ignore"):
-            ok = (hits.shape >= 0) & (uvz[:, 0] > -m) & (uvz[:, 0] < w - 1 + m) & (uvz[:, 1] > -m) & (uvz[:, 1] < h - 1 + m)
+            ok = (hits.shape >= 0) & (uvz[:, 0] > -m) & (uvz[:, 0] < w - 1 + m)
+            ok &= (uvz[:, 1] > -m) & (uvz[:, 1] < h - 1 + m)
         k = np.flatnonzero(ok)
         ok[k] = lit(self.scene.shapes, hits.point[k], hits.normal[k], self._centre)
         return uvz, ok
@@ -271,7 +278,9 @@ class Renderer:
         return _Surface(hits, colours, alpha, f0, scatter, shiny)
 
     def _response(self, cam: Camera, colour: tuple[float, float, float], pixel: AnyArray) -> F64:
-        """Response (n, 3) of pixels' sensor sites to surface colour under a light; a green (or mono) site answers white with 1."""
+        """Response (n, 3) of pixels' sensor sites to surface colour under a light; a green (or mono) site answers white
+        with 1.
+        """
         fmt = self.instrument.pixel_formats[self.instrument.rig.index(cam.name)]
         M = self.instrument.sensor.response(fmt)
         M = M * np.asarray(colour) / M[len(M) // 2].sum()
@@ -322,8 +331,8 @@ class Renderer:
         where = self._surface(cam, second, d[k], pixel[k])
         value, none = np.empty(len(k)), np.zeros(len(k))
         loops.reflect(
-            second.point, second.normal, where.shiny, out[k], self._centre, inst.rig.projector.pose.R[2], inst.projector.focus_mm,
-            inst.projector.falloff, where.alpha, none, where.colours[0], none, 0.01, value,
+            second.point, second.normal, where.shiny, out[k], self._centre, inst.rig.projector.pose.R[2],
+            inst.projector.focus_mm, inst.projector.falloff, where.alpha, none, where.colours[0], none, 0.01, value,
         )  # fmt: skip
         value *= optics.fresnel(surface.f0[k], ne[k]) * light
         keep = np.flatnonzero(value > MIRROR_MIN)
@@ -336,7 +345,9 @@ class Renderer:
         return np.stack([r.radius * np.cos(a), r.radius * np.sin(a), np.full(r.lamps, r.height)], 1)
 
     def _ring_shadows(self, hits: Hits, width: int) -> Bool:
-        """Which lamps of the ring reach whole rows of hits (lamps, n): traced at every second row and column, for it is soft."""
+        """Which lamps of the ring reach whole rows of hits (lamps, n): traced at every second row and column, for it is
+        soft.
+        """
         index = np.arange(len(hits.t)).reshape(-1, width)
         few = index[::2, ::2].ravel()
         out = np.empty((self.instrument.ring.lamps, len(hits.t)), bool)
@@ -377,7 +388,8 @@ def _pick(s: _Sparse, keep: Bool) -> dict[str, AnyArray]:
 def _footprint(u: F32, v: F32, gain: F32, shape: AnyArray, aspect: float) -> tuple[F32, Bool]:
     """Projector-plane units (along v) per pixel (H, W), and where (H W,) a pixel's surroundings are not smooth.
 
-    Not smooth: another shape, shadow or light beside it, a fifth more or less gain in a like-coloured neighbour, or bent (u, v).
+    Not smooth: another shape, shadow or light beside it, a fifth more or less gain in a like-coloured neighbour, or
+    bent (u, v).
     """
     bent = np.zeros(u.shape, np.float32)
     length = np.zeros(u.shape, np.float32)

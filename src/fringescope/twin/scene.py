@@ -1,4 +1,4 @@
-"""Scenes with exact truth: plane, sphere, steps, board, and three tissue specimens. The same seed gives the same scene."""
+"""Scenes with exact truth: plane, sphere, steps, board, three tissue specimens. One seed gives one scene."""
 
 from __future__ import annotations
 
@@ -84,11 +84,11 @@ def _plane(seed: int, lift: float, rng: np.random.Generator) -> Scene:
 def _sphere(seed: int, lift: float, rng: np.random.Generator) -> Scene:
     base = -9.0 + lift
     small, large = rng.uniform(-2, 2, (2, 2))
-    spheres = []
-    for radius, (x, y) in ((5.00065, small + (-8.0, 3.0)), (12.0, large + (25.0, -5.0))):
-        spheres.append({"center": [float(x), float(y), base + radius], "radius": radius})
+    places = ((5.00065, small[0] - 8.0, small[1] + 3.0), (12.0, large[0] + 25.0, large[1] - 5.0))
+    balls = [Sphere(CERAMIC, (float(x), float(y), base + r), r) for r, x, y in places]
     shapes: list[Shape] = [tilted_plane(np.eye(3), (0.0, 0.0, base), STEEL)]
-    shapes += [Sphere(CERAMIC, tuple(s["center"]), s["radius"]) for s in spheres]
+    shapes += balls
+    spheres = [{"center": list(b.center), "radius": b.radius} for b in balls]
     return Scene("sphere", seed, tuple(shapes), truth={"sphere.json": {"spheres": spheres, "base_z": base}})
 
 
@@ -112,7 +112,7 @@ def board_pose(seed: int, pose: int, board: boards.Board, lift: float = 0.0) -> 
     lean = 0.03 if pose == 0 else rng.uniform(0.12, 0.43)
     towards = 2.4 * pose + rng.uniform(-0.4, 0.4)
     R = _turn("z", towards) @ _turn("x", lean) @ _turn("z", -towards + rng.uniform(-0.3, 0.3)) @ np.diag([1.0, -1, -1])
-    at = rng.uniform([-9, -6, -9], [9, 6, 9]) + (0, 0, lift)
+    at = rng.uniform([-9, -6, -9], [9, 6, 9]) + np.array([0, 0, lift])
     return Pose(R, at - R @ middle)
 
 

@@ -1,4 +1,4 @@
-"""What rays can hit: analytic plane, sphere and boxes (exact), and a triangle mesh (Embree, hits refined in float64)."""
+"""What rays can hit: analytic plane, sphere and boxes (exact), a triangle mesh (Embree, refined in float64)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ IDENTITY = Pose(np.eye(3), np.zeros(3))
 
 @dataclass(frozen=True, eq=False)
 class Plane(_Analytic):
-    """A rectangle in the plane z = 0 of its own frame (T_world_own), x in `x_range`, y in `y_range`, seen from both sides."""
+    """A rectangle in the plane z = 0 of its own frame (T_world_own), x in `x_range`, y in `y_range`, seen from both
+    sides.
+    """
 
     finish: Finish
     pose: Pose = IDENTITY  #: p_world = R p_own + t
@@ -101,7 +103,9 @@ class Sphere(_Analytic):
             t = -b - np.sqrt(q)
         t = np.where((q > 0) & (t > NEAR), t, np.inf)
         with np.errstate(invalid="ignore"):
-            n = np.where(np.isfinite(t)[:, None], (o + np.where(np.isfinite(t), t, 0)[:, None] * directions) / self.radius, 0)
+            n = np.where(
+                np.isfinite(t)[:, None], (o + np.where(np.isfinite(t), t, 0)[:, None] * directions) / self.radius, 0
+            )
         return t, n
 
 
@@ -172,6 +176,7 @@ class Mesh:
 
     def blocks(self, origins: F64, directions: F64, reach: F64) -> Bool:
         """See `Shape`. `reach` is taken as endless: lights lie beyond every mesh."""
+        del reach
         found = self._scene().run(
             np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32), query="OCCLUDED"
         )

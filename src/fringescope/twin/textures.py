@@ -1,4 +1,6 @@
-"""Colour and shine of surfaces: constants, boards, and procedural organ-like maps. Reflectances are linear, 0..1, (red, green, blue)."""
+"""Colour and shine of surfaces: constants, boards, and procedural organ-like maps. Reflectances are linear, 0..1, (red,
+green, blue).
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ def uniform(colour: Colour) -> Callable[[F64], F64]:
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A map on a regular grid of own x and y: `values` (h, w, k), sample (0, 0) at `origin`, `step` mm; edges repeat."""
+    """A map on a grid of own x and y: `values` (h, w, k), sample (0, 0) at `origin`, `step` mm; edges repeat."""
 
     values: F32
     origin: tuple[float, float]
@@ -58,7 +60,11 @@ def noise(x: AnyArray, y: AnyArray, cell_mm: float, rng: np.random.Generator) ->
     """Smooth random field at (x, y): cubic spline over a random lattice of `cell_mm`; mean 0, about -1..1."""
     lattice = rng.uniform(-1.4, 1.4, (96, 96))
     out: F64 = map_coordinates(
-        lattice, [np.asarray(y) / cell_mm + 47.3, np.asarray(x) / cell_mm + 46.1], order=3, mode="grid-wrap", prefilter=False
+        lattice,
+        [np.asarray(y) / cell_mm + 47.3, np.asarray(x) / cell_mm + 46.1],
+        order=3,
+        mode="grid-wrap",
+        prefilter=False,
     )
     return out
 
@@ -71,7 +77,7 @@ def fractal(x: AnyArray, y: AnyArray, cell_mm: float, octaves: int, rng: np.rand
     return out
 
 
-def _mix(a: AnyArray, b: AnyArray, t: AnyArray) -> F64:
+def _mix(a: AnyArray, b: Colour, t: AnyArray) -> F64:
     return np.asarray(a + (np.asarray(b) - a) * np.clip(t, 0, 1)[..., None])
 
 
@@ -87,14 +93,14 @@ class Palette:
     dark_share: float = 0.0
 
 
-HEART = Palette((0.47, 0.13, 0.10), (0.20, 0.045, 0.045), (0.78, 0.66, 0.42), (0.26, 0.05, 0.06), -0.15, 0.0)
-GUT = Palette((0.74, 0.42, 0.36), (0.46, 0.14, 0.12), (0.84, 0.72, 0.58), (0.40, 0.09, 0.10), 0.0, -0.2)
-FASCIA = Palette((0.60, 0.27, 0.22), (0.34, 0.09, 0.08), (0.86, 0.80, 0.68), (0.33, 0.08, 0.12), 0.25, -0.3)
+HEART = Palette((0.36, 0.075, 0.06), (0.13, 0.03, 0.03), (0.74, 0.60, 0.36), (0.20, 0.035, 0.045), -0.12, 0.25)
+GUT = Palette((0.66, 0.31, 0.25), (0.36, 0.085, 0.075), (0.80, 0.62, 0.46), (0.34, 0.07, 0.08), 0.0, 0.1)
+FASCIA = Palette((0.50, 0.19, 0.15), (0.24, 0.055, 0.05), (0.82, 0.74, 0.60), (0.28, 0.06, 0.10), 0.15, 0.0)
 
 
 def organ(palette: Palette, seed: int, half_x: float = 46.0, half_y: float = 32.0, step: float = 0.1) -> Raster:
     """An organ-like reflectance map: body colour, dark and pale zones, fibres, branching vessels, fine grain."""
-    rng = np.random.default_rng([seed, 7])
+    rng = np.random.default_rng([seed, 7, int(1000 * palette.body[1])])
     x, y = np.meshgrid(np.arange(-half_x, half_x + step, step), np.arange(-half_y, half_y + step, step))
     wx, wy = x + 4 * noise(x, y, 14, rng), y + 4 * noise(x, y, 14, rng)
     c = np.broadcast_to(np.asarray(palette.body), (*x.shape, 3))
@@ -109,7 +115,7 @@ def organ(palette: Palette, seed: int, half_x: float = 46.0, half_y: float = 32.
     return Raster(np.clip(c, 0.01, 0.92).astype(np.float32), (float(x[0, 0]), float(y[0, 0])), step)
 
 
-def film(seed: int, slope: float, cell_mm: float = 1.6, half: float = 48.0, step: float = 0.15) -> Raster:
+def film(seed: int, slope: float, cell_mm: float = 1.6, half: float = 90.0, step: float = 0.15) -> Raster:
     """Slopes (2) of a wavy wet film: standard deviation about `slope`."""
     rng = np.random.default_rng([seed, 11])
     x, y = np.meshgrid(np.arange(-half, half + step, step), np.arange(-half, half + step, step))

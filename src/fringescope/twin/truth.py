@@ -50,4 +50,6 @@ def write(scene: Scene, rig: Rig, folder: Path) -> None:
             else:
                 (folder / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     except OSError as e:
-        raise OutputError(f"{folder}: the truth cannot be written ({e.strerror}); choose another folder or free space") from e
+        raise OutputError(
+            f"{folder}: the truth cannot be written ({e.strerror}); choose another folder or free space"
+        ) from e
