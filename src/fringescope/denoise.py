@@ -8,6 +8,7 @@ move one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from fringescope import geometry
 from fringescope.kernels import regions as k
 from fringescope.settings import DenoiseSettings
-from fringescope.types import F64, U16, Bool, Decoded, Direction, Grid, PixelFormat, Reason, Rig, WrappedSet
+from fringescope.types import F64, U16, Bool, Decoded, Direction, Grid, PixelFormat, Reason, Rig, ViewVerdict, WrappedSet
 
 
 def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> U16:
@@ -144,5 +145,59 @@ def _slopes(d: Direction, reasons: U16, decoded: Decoded, rig: Rig | None) -> F6
 
 
 def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings) -> tuple[Grid, ...]:
-    """Where views overlap, points that the other views contradict go."""
-    return tuple(grids)
+    """Where views overlap: a point in front of what another view sees through it, and that no view confirms, goes.
+
+    A point confirmed by any other view stays; one that lies behind another view's surface is hidden there and stays.
+    """
+    out = []
+    for g in grids:
+        H, W = g.reasons.shape
+        confirmed, denied = np.zeros((H, W), np.uint8), np.zeros((H, W), np.uint8)
+        for o in grids:
+            if o.view == g.view:
+                continue
+            camera = rig.cameras[o.view]
+            k.cross_examine(
+                g.xyz, g.sigma, o.xyz, o.sigma, camera.pose.R, camera.pose.t, geometry.lens_vector(camera.lens),
+                s.agree_sigma, s.agree_slack, confirmed, denied,
+            )
+        bad = (denied > 0) & (confirmed == 0)
+        reasons, xyz, sigma = g.reasons.copy(), g.xyz.copy(), g.sigma.copy()
+        reasons[bad] |= np.uint16(Reason.VIEWS_DISAGREE)
+        xyz[bad] = np.nan
+        sigma[bad] = np.nan
+        out.append(replace(g, xyz=xyz, sigma=sigma, reasons=reasons))
+    return tuple(out)
+
+
+def verdict(grid: Grid, s: DenoiseSettings) -> ViewVerdict:
+    """What a view lost and why, in figures and in words that a person can act on."""
+    n = int(grid.reasons.size)
+    lost = {r.name.lower(): int(((grid.reasons & r) != 0).sum()) for r in Reason if r.name}
+    points = int((grid.reasons == 0).sum())
+    lit = n - lost["dark"]
+    blamed = np.where(grid.reasons & Reason.DARK, np.uint16(Reason.DARK), grid.reasons)
+    words = [f"{grid.camera}: {points} points on {lit} lit pixels of {n}"]
+    if not points:
+        words.append(f"{grid.camera}: no point was left")
+    for reason, share, advice in _ADVICE:
+        part = float(((blamed & reason) != 0).sum()) / (n if reason is Reason.DARK else max(lit, 1))
+        if part > share:
+            words.append(f"{grid.camera}: {100 * part:.1f} % {reason.label}: {advice}")
+    return ViewVerdict(grid.camera, n, points, lost, tuple(words))
+
+
+#: reason, share of the lit pixels (of all pixels for DARK) above which it is worth a word, and what to do
+_ADVICE = (
+    (Reason.DARK, 0.97, "no fringes reached this view: check lens cap, trigger and projector"),
+    (Reason.SATURATED, 0.01, "halve the exposure, or add a shorter bracket"),
+    (Reason.LOW_MODULATION, 0.15, "shadow, defocus or scattered light: raise the exposure, refocus, or turn the specimen"),
+    (Reason.ORDER_UNCERTAIN, 0.02, "the coarse fringes are too noisy for the fine ones: add a set between, or more light"),
+    (Reason.REVERSED, 0.005, "mirrored fringes: dry the surface or put something dark below it"),
+    (Reason.JUMP, 0.05, "edges and steep walls: turn the specimen"),
+    (Reason.ISLAND, 0.02, "crumbs without neighbours: raise the exposure, or lower denoise.island_share"),
+    (Reason.OUT_OF_VOLUME, 0.05, "points outside the measuring volume: move the specimen into it, or check the rig"),
+    (Reason.INCONSISTENT, 0.01, "frames do not fit one sinusoid: something moved, or a frame is out of order"),
+    (Reason.VIEWS_DISAGREE, 0.02, "the views contradict each other: the rig has drifted, calibrate anew"),
+    (Reason.NOT_LOCAL, 0.05, "rough phase: light from surface to surface, or vibration"),
+)

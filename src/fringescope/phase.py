@@ -557,3 +557,8 @@ def projector_coordinates(decoded: Decoded) -> tuple[F32, F32]:
         elif abs(g[0]) < PARALLEL_RAD * abs(g[1]):
             v = (d[0].phase / (2 * math.pi * g[1])).astype(np.float32)
     return u, v
+
+
+def with_reasons(decoded: Decoded, reasons: U16) -> Decoded:
+    """The same decoded view with other reasons (H, W)."""
+    return replace(decoded, reasons=reasons)

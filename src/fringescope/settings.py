@@ -82,6 +82,9 @@ class DenoiseSettings(_Section):
     local_sigma: float = knob(4.5, "sigma", "largest distance of a point from the local surface", "", 0)
     local_roughness: float = knob(2.8, "sigma", "largest rms of the neighbours about the local surface", "", 0)
     local_rounds: int = knob(1, "", "how often the local test is repeated on what is left", "", 0, 5)
+    agree_sigma: float = knob(6.0, "sigma", "a view contradicts a point if it sees this far behind it", "", 0)
+    agree_slack: float = knob(0.5, "pixels", "allowance for the sampling of the other view, in its pixels' footprints", "", 0)
+    volume_margin: float = knob(1.25, "", "the rig's measuring volume is grown by this", "", 1)
 
 
 @dataclass(frozen=True)

@@ -530,10 +530,16 @@ class ViewVerdict:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The result of the main job: one grid per view, the fused cloud, the surface, what was lost and why."""
+    """The result of the main job: one grid per view, the fused cloud, the surface, what was lost and why.
+
+    `surface` is the finest level of detail, `preview` the coarsest; `all_points` every valid pixel of every view, where
+    it was asked for.
+    """
 
     grids: tuple[Grid, ...]
     cloud: Cloud
     surface: Surface | None
     verdicts: tuple[ViewVerdict, ...]
     figures: Mapping[str, Any] = field(default_factory=dict)
+    preview: Surface | None = None
+    all_points: Cloud | None = None
