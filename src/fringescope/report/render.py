@@ -73,7 +73,7 @@ def render_surface(
     """Picture of a textured mesh, (height, width, 3) sRGB, or with alpha (.., 4) where `background` is None.
 
     `size` = (width, height). `coloured` False draws a shaded relief; coloured pictures are exposed so that their
-    brightest parts reach 0.8. What was not measured shows the background. Deterministic. Raises EmptyResultError for a
+    brightest parts reach 0.65. What was not measured shows the background. Deterministic. Raises EmptyResultError for a
     surface without triangles.
     """
     if not surface.n_faces:
@@ -213,7 +213,7 @@ def _finish(c: _Canvas, light: Light, background: tuple[int, int, int] | None, s
     draw.light(c.depth, c.colour, c.normal, shade, ss, c.R[2], key, np.array([0, 0, 1.0]), half, strength, rgb, alpha)
     if exposed and (alpha > 0.5).any():
         bright = float(np.percentile(rgb[alpha > 0.5].max(1), 98))
-        rgb *= min(max(0.8 / max(bright, 1e-6), 0.5), 4.0)
+        rgb *= min(max(0.65 / max(bright, 1e-6), 0.5), 4.0)
     if background is None:
         straight = _srgb(rgb / np.maximum(alpha, 1e-6)[..., None])
         return np.concatenate([straight, np.rint(255 * alpha[..., None]).astype(np.uint8)], 2)
