@@ -48,6 +48,24 @@ class PlaneFit:
         """Numbers only, for `--json`."""
         return plain(self)
 
+    @property
+    def deviation_um(self) -> F64:
+        """(n,) deviation of the plane's own points, NaN elsewhere: with `flat_mm` what `report.error_map` draws."""
+        return np.where(self.own, 1e3 * self.error_mm, np.nan)
+
+    def lines(self) -> tuple[tuple[str, str], ...]:
+        """Name and value of the main figures, for people."""
+        s = self.spread
+        form = (("form", f"{self.form_um:.2f} µm"),) if self.form_um is not None else ()
+        return (
+            ("points", f"{self.inliers:,}"),
+            ("std", f"{s.std_um:.2f} µm"),
+            ("rms", f"{s.rms_um:.2f} µm"),
+            ("p99", f"{s.p99_um:.1f} µm"),
+            *form,
+            ("flying", f"{self.flying_ppm:.0f} ppm"),
+        )
+
 
 def search_plane(p: F64, band: float, rng: np.random.Generator, tries: int = 600) -> tuple[F64, F64, float]:
     """The plane that holds most of a sample within `band`: point, normal, share."""

@@ -57,6 +57,24 @@ class SphereFit:
         """Numbers only, for `--json`."""
         return plain(self)
 
+    @property
+    def deviation_um(self) -> F64:
+        """(n,) deviation of the sphere's own points, NaN elsewhere: with `flat_mm` what `report.error_map` draws."""
+        return np.where(self.own, 1e3 * self.error_mm, np.nan)
+
+    def lines(self) -> tuple[tuple[str, str], ...]:
+        """Name and value of the main figures, for people."""
+        s = self.spread
+        error = self.radius_error_um
+        return (
+            ("points", f"{self.inliers:,}"),
+            ("radius", f"{self.radius_mm:.4f} mm"),
+            *((("radius error", f"{error:+.2f} µm".replace("-", "−")),) if error is not None else ()),
+            ("std", f"{s.std_um:.2f} µm"),
+            ("rms", f"{s.rms_um:.2f} µm"),
+            ("p99", f"{s.p99_um:.1f} µm"),
+        )
+
 
 def fit_sphere(
     xyz: ArrayLike, nominal_radius_mm: float | None = None, band_mm: float = BAND_MM, seed: int = 0

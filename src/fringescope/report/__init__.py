@@ -12,14 +12,17 @@ from fringescope.report.figures import (
     reasons_picture,
 )
 from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_cloud, render_surface
+from fringescope.report.story import VIEWPOINTS, around, story
 
 __all__ = [
     "DARK",
     "REASON_COLOURS",
+    "VIEWPOINTS",
     "WHITE",
     "Light",
     "Panel",
     "Viewpoint",
+    "around",
     "bin_map",
     "contact_sheet",
     "error_map",
@@ -29,4 +32,5 @@ __all__ = [
     "reasons_picture",
     "render_cloud",
     "render_surface",
+    "story",
 ]

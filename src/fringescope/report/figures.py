@@ -238,7 +238,7 @@ def reasons_map(
             legend.text(2.65, y, share, va="center", ha="right", fontsize=9.5, color=PALE)
             y -= 0.3
         note = "A pixel may have several reasons;\nits colour is that of the first."
-        legend.text(0, y - 0.1, note, fontsize=8, color=PALE)
+        legend.text(0, y - 0.2, note, fontsize=8, color=PALE)
         return _picture(fig, path)
 
 
@@ -310,10 +310,16 @@ def _fitted(image: NDArray[Any], w: int, h: int) -> U8:
 
 def fringe_picture(frame: NDArray[Any], bits: int = 8, gamma: float = 0.6) -> U8:
     """A raw frame (H, W) as people see it: Bayer sites averaged over 2 x 2, brightened by `gamma`, (H, W) uint8."""
-    x = frame.astype(np.float32) / float((1 << bits) - 1)
-    soft = (x + np.roll(x, -1, 0) + np.roll(x, -1, 1) + np.roll(x, (-1, -1), (0, 1))) / 4
+    soft = soften(frame.astype(np.float32) / float((1 << bits) - 1))
     high = max(float(np.percentile(soft, 99.7)), 1e-6)
     out: U8 = np.rint(255 * np.clip(soft / high, 0, 1) ** gamma).astype(np.uint8)
+    return out
+
+
+def soften(a: NDArray[Any]) -> F32:
+    """Mean of each 2 x 2 neighbourhood of (H, W): a Bayer mosaic without its pattern."""
+    x = np.pad(np.nan_to_num(np.asarray(a, dtype=np.float32)), ((0, 1), (0, 1)), mode="reflect")
+    out: F32 = (x[:-1, :-1] + x[1:, :-1] + x[:-1, 1:] + x[1:, 1:]) / np.float32(4)
     return out
 
 

@@ -13,7 +13,7 @@ from fringescope.errors import EmptyResultError, UsageError
 from fringescope.kernels import draw
 from fringescope.types import F32, F64, U8, Cloud, Surface
 
-CLAY = (0.72, 0.70, 0.67)  #: albedo of a relief, linear light
+CLAY = (0.60, 0.58, 0.55)  #: albedo of a relief, linear light
 WHITE = (255, 255, 255)
 DARK = (17, 20, 26)
 
@@ -43,8 +43,8 @@ class Light:
     `gloss` is the strength of the wet highlight, `shade` of the shade in hollows (0 = none).
     """
 
-    key: float = 0.72
-    sky: float = 0.42
+    key: float = 0.85
+    sky: float = 0.33
     gloss: float = 0.10
     shade: float = 0.75
 
@@ -185,8 +185,7 @@ def _fit_texture(texture: F32, screen: F64, uv: F32, faces: NDArray[np.uint32]) 
     """The texture reduced until a texel is not much smaller than a sample of the screen."""
     f = faces[:: max(1, len(faces) // 2000)].astype(np.int64)
     s, t = screen[f, :2], uv[f] * [texture.shape[1], texture.shape[0]]
-    on_screen = np.abs(np.cross(s[:, 1] - s[:, 0], s[:, 2] - s[:, 0]))
-    on_texture = np.abs(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]))
+    on_screen, on_texture = _areas(s), _areas(t)
     ok = np.isfinite(on_screen) & (on_screen > 0)
     if not ok.any():
         return texture
@@ -195,6 +194,13 @@ def _fit_texture(texture: F32, screen: F64, uv: F32, faces: NDArray[np.uint32]) 
         return texture
     small = (max(1, round(texture.shape[1] / scale)), max(1, round(texture.shape[0] / scale)))
     return np.asarray(cv2.resize(texture, small, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _areas(t: NDArray[np.floating]) -> F64:
+    """Twice the areas of triangles (m, 3 corners, 2)."""
+    a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    out: F64 = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return out
 
 
 # --------------------------------------------------------------------------------------------------------------- light
