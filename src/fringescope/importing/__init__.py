@@ -14,7 +14,20 @@ from fringescope.importing.order import Evidence, look
 from fringescope.importing.preview import draw
 from fringescope.types import PixelFormat, ViewInput
 
-__all__ = ["Evidence", "Gray", "ImportedView", "LooseFrames", "Recipe", "draw", "find_views", "look", "put_import"]
+__all__ = [
+    "Evidence",
+    "Gray",
+    "ImportedView",
+    "LooseFrames",
+    "Recipe",
+    "draw",
+    "find_views",
+    "look",
+    "put_import",
+    "stack_view",
+]
+
+ONE_FRINGE = 1000  #: period given to a stack's only set; the field is a little shorter, so that no order is in doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +81,23 @@ def find_views(
     if not folders:
         raise CaptureError(f"{source}: holds no images ({pattern}); needed PNG, TIFF, BMP or PGM files")
     return tuple(_view(p, n, recipe, pattern, pixel_format, shift, color) for n, p in folders.items())
+
+
+def stack_view(
+    path: Path | str, steps: int | None, axis: str | None, time: int | None, fmt: PixelFormat | None
+) -> tuple[ViewInput, str, str]:
+    """A TIFF stack of one set as a view without a known period: what was chosen, and the file's hash, with it.
+
+    The set counts as one fringe across the field, so that its phase comes out wrapped, in 0 .. 2 pi. Raises as
+    `find_views`.
+    """
+    path = Path(path)
+    stack = stack_pages(path, steps, axis, time)
+    images = LooseFrames(path.parent, stack.names, fmt=fmt)
+    recipe = Recipe((len(stack.names),), (float(ONE_FRINGE),), projector=(round(0.98 * ONE_FRINGE), 1))
+    plan = recipe.plan("camera1", images.fmt)
+    note = f"{stack.note}; no period is known: the phase is wrapped, 0 to 2 pi"
+    return ViewInput(plan, RecipeFrames(images, recipe, plan)), note, f"sha256:{images.digest()}"
 
 
 def _view(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -99,6 +99,10 @@ class Recipe:
                 raise UsageError(f"--steps {steps[i]}; phase shifting needs at least 3")
             out.append(FringeSet((d[0] / p, d[1] / p), steps[i]))
         return tuple(out)
+
+    def reversed(self) -> Recipe:
+        """The same with the steps of every set running the other way."""
+        return replace(self, reverse=tuple(i for i in range(len(self.sets)) if i not in self.reverse))
 
     @property
     def files_needed(self) -> int:
@@ -195,6 +199,10 @@ class LooseFrames:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def digest(self) -> str:
+        """sha256 of the first image's file, hexadecimal."""
+        return self._images.digest(self.names[0])
 
 
 class RecipeFrames:

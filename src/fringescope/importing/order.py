@@ -53,11 +53,21 @@ class Evidence:
     def figures(self) -> dict[str, object]:
         """As plain numbers and words, for JSON."""
         return {
-            "order": self.verdict, "proved": self.proved, "against": self.against, "notes": self.notes,
+            "order": self.verdict,
+            "proved": self.proved,
+            "against": self.against,
+            "notes": self.notes,
             "use": self.options,
             "sets": [
-                {"set": s.index, "steps": s.set.steps, "period": s.set.period, "residual": s.residual,
-                 "best_order": list(s.best_order), "best_residual": s.best_residual, "slope_rad_per_px": list(s.slope)}
+                {
+                    "set": s.index,
+                    "steps": s.set.steps,
+                    "period": s.set.period,
+                    "residual": s.residual,
+                    "best_order": list(s.best_order),
+                    "best_residual": s.best_residual,
+                    "slope_rad_per_px": list(s.slope),
+                }
                 for s in self.sets
             ],
             "pairs": [{"coarse": p.coarse, "fine": p.fine, "misfit_cycles": p.misfit_cycles} for p in self.pairs],
@@ -79,7 +89,8 @@ def look(images: LooseFrames, recipe: Recipe) -> Evidence:
     for family in families(recipe.sets):
         _density(ev, family)
         if not ev.against:
-            _sense(ev, family, code if recipe.gray and _is_along(recipe.sets[family[0]], recipe.gray.axis) else None)
+            along = recipe.gray is not None and _is_along(recipe.sets[family[0]], recipe.gray.axis)
+            _sense(ev, family, recipe, code if along else None)
         if not ev.against:
             _chain(ev, family, recipe, code is not None)
     ev.proved[:] = dict.fromkeys(ev.proved)
@@ -125,8 +136,10 @@ def _steps(ev: Evidence, images: LooseFrames, recipe: Recipe) -> None:
             ev.against.append(f"{miss}, as --order {name} much less")
             ev.options.append(f"--order {name}")
             return
-    ev.against.append(f"{miss}, and in no order less: not {worst.set.steps} equal steps of one set; "
-                      "look at the preview, and mend --steps or the choice of files")
+    ev.against.append(
+        f"{miss}, and in no order less: not {worst.set.steps} equal steps of one set; "
+        "look at the preview, and mend --steps or the choice of files"
+    )
 
 
 def _density(ev: Evidence, family: list[int]) -> None:
@@ -150,7 +163,7 @@ def _density(ev: Evidence, family: list[int]) -> None:
     ev.options.append(f"--periods {listed}")
 
 
-def _sense(ev: Evidence, family: list[int], code: tuple[float, float] | None) -> None:
+def _sense(ev: Evidence, family: list[int], recipe: Recipe, code: tuple[float, float] | None) -> None:
     """All sets of a direction must grow the same way in the picture, and as the Gray code does."""
     finest = ev.sets[family[-1]]
     for i in family[:-1]:
@@ -161,7 +174,7 @@ def _sense(ev: Evidence, family: list[int], code: tuple[float, float] | None) ->
         along_axis = 1.0 if sum(finest.set.cycles_per_pixel) > 0 else -1.0
         if _dot(code, finest.slope) * along_axis < 0:
             ev.against.append("the phase grows against the Gray code: the steps run backwards")
-            ev.options.append("--reverse-steps")
+            ev.options.append("without --reverse-steps" if recipe.reverse else "--reverse-steps")
         else:
             ev.proved.append("the phase grows as the Gray code does")
 
@@ -189,13 +202,17 @@ def _chain(ev: Evidence, family: list[int], recipe: Recipe, sense_known: bool) -
     best = min(fits.values())
 
     def option(h: tuple[bool, int]) -> str:
-        first = f"--first-phase {(recipe.first_phase_deg + 360 * h[1] / common) % 360:g}" if h[1] else ""
-        return " ".join(filter(None, ("--reverse-steps" if h[0] else "", first)))
+        first = ((-1 if h[0] else 1) * recipe.first_phase_deg + 360 * h[1] / common) % 360
+        shift = f"--first-phase {first:g}" if first or recipe.first_phase_deg else ""
+        turned = ("without --reverse-steps" if recipe.reverse else "--reverse-steps") if h[0] else ""
+        return " ".join(filter(None, (turned, shift)))
 
     if best < CLEARLY * given and best < AGREE and given > AGREE / 2:
         ways = " or ".join(option(h) for h, x in fits.items() if x < 1.3 * best + 0.01)
-        ev.against.append(f"fine phases miss what the coarse ones foretell by {given:.2f} cycles; they agree within "
-                          f"{best:.2f} with {ways}")
+        ev.against.append(
+            f"fine phases miss what the coarse ones foretell by {given:.2f} cycles; they agree within "
+            f"{best:.2f} with {ways}"
+        )
         ev.options.append(ways)
         return
     if given > AGREE:
@@ -206,8 +223,10 @@ def _chain(ev: Evidence, family: list[int], recipe: Recipe, sense_known: bool) -
     if same:
         x, y = ev.sets[family[-1]].slope
         way = ("right" if x > 0 else "left") if abs(x) > abs(y) else ("down" if y > 0 else "up")
-        ev.notes.append(f"the images fit {' or '.join(same)} as well; as given, the projector's coordinate grows "
-                        f"{way} in the picture: see that it did")
+        ev.notes.append(
+            f"the images fit {' or '.join(same)} as well; as given, the projector's coordinate grows "
+            f"{way} in the picture: see that it did"
+        )
 
 
 def _misfits(sets: list[SetEvidence], lit: Bool, recipe: Recipe, reverse: bool, turn: float) -> list[float]:

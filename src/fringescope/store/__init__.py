@@ -4,13 +4,15 @@ from fringescope.store.capture import (
     Capture,
     CaptureView,
     Frames,
+    check_rig,
     hash_capture,
     put_capture,
+    put_patterns,
     read_capture,
     view_inputs,
     write_capture,
 )
-from fringescope.store.files import new_file, new_folder
+from fringescope.store.files import new_file, new_folder, write_json
 from fringescope.store.images import write_png, write_tiff
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
 from fringescope.store.scan import (
@@ -29,6 +31,7 @@ __all__ = [
     "CaptureView",
     "Frames",
     "StoredScan",
+    "check_rig",
     "hash_capture",
     "hash_rig",
     "lost",
@@ -37,6 +40,7 @@ __all__ = [
     "plain",
     "put_capture",
     "put_decoded",
+    "put_patterns",
     "put_scan",
     "read_capture",
     "read_rig",
@@ -45,6 +49,7 @@ __all__ = [
     "view_inputs",
     "write_capture",
     "write_decoded",
+    "write_json",
     "write_png",
     "write_rig",
     "write_scan",

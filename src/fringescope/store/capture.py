@@ -23,7 +23,9 @@ from fringescope.types import (
     GraySet,
     Layout,
     NoiseModel,
+    PatternPlan,
     PixelFormat,
+    Rig,
     Role,
     ViewInput,
     ViewPlan,
@@ -207,22 +209,24 @@ def _view(m: _View, i: int, noise: _Noise | None, size: tuple[int, int], documen
 
 def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
     if (s.gray is None) == (s.cycles_per_pixel is None):
-        raise CaptureError("needed either \"cycles_per_pixel\" (fringes) or \"gray\" (Gray code)")
+        raise CaptureError('needed either "cycles_per_pixel" (fringes) or "gray" (Gray code)')
     if s.gray is not None:
         if s.cell is None:
-            raise CaptureError("a Gray code without \"cell\"; needed the width of one code value")
+            raise CaptureError('a Gray code without "cell"; needed the width of one code value')
         if s.inverse is not None and len(s.inverse) != len(s.frames):
             raise CaptureError(f"{len(s.inverse)} inverse frames for {len(s.frames)} frames; needed as many")
         gray = GraySet(s.gray, s.cell, len(s.frames), s.inverse is not None, s.white is not None, s.black is not None)
         pick: dict[Role, Callable[[int], str | None]] = {
-            Role.WHITE: lambda _: s.white, Role.BLACK: lambda _: s.black,
-            Role.BIT: lambda n: s.frames[n], Role.INVERSE: lambda n: (s.inverse or [])[n],
+            Role.WHITE: lambda _: s.white,
+            Role.BLACK: lambda _: s.black,
+            Role.BIT: lambda n: s.frames[n],
+            Role.INVERSE: lambda n: (s.inverse or [])[n],
         }
         keys = ViewPlan("x", PixelFormat.MONO8, (gray,), (1, 1)).keys
         return gray, [str(pick[k.role](k.number)) for k in keys]
     steps = len(s.frames) if s.steps is None else s.steps
     if s.steps is not None and s.steps != len(s.frames):
-        raise CaptureError(f"\"steps\" is {s.steps} but it names {len(s.frames)} frames; needed as many")
+        raise CaptureError(f'"steps" is {s.steps} but it names {len(s.frames)} frames; needed as many')
     g = s.cycles_per_pixel
     if g is None or len(g) != 2:
         raise CaptureError(f"cycles_per_pixel {files.shown(g)}; needed two numbers")
@@ -244,7 +248,7 @@ def view_inputs(capture: Capture) -> tuple[ViewInput, ...]:
 
 
 def hash_capture(capture: Capture) -> str:
-    """"sha256:..." over capture.json (as a JSON object) and the content of every file that it names.
+    """ "sha256:..." over capture.json (as a JSON object) and the content of every file that it names.
 
     Frames that were read already are not read again.
     """
@@ -259,7 +263,11 @@ def hash_capture(capture: Capture) -> str:
 
 
 def put_capture(
-    folder: Path, width: int, height: int, layout: Layout, views: Iterable[ViewInput],
+    folder: Path,
+    width: int,
+    height: int,
+    layout: Layout,
+    views: Iterable[ViewInput],
     extra: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes a capture into an existing folder, frame by frame as `views` hand them out (any order within a view).
@@ -275,13 +283,54 @@ def put_capture(
     files.write_json(folder / files.CAPTURE, doc)
 
 
-def _put_view(folder: Path, view: ViewInput) -> dict[str, Any]:
-    plan = view.plan
+def _frame_names(plan: ViewPlan) -> dict[FrameKey, str]:
     if bad := files.check_name(plan.camera):
         raise CaptureError(f"camera {files.shown(plan.camera)}: {bad}")
-    keys = plan.keys
-    digits = max(2, len(str(len(keys) - 1)))
-    names = {k: f"{plan.camera}/{i:0{digits}d}.png" for i, k in enumerate(keys)}
+    digits = max(2, len(str(len(plan.keys) - 1)))
+    return {k: f"{plan.camera}/{i:0{digits}d}.png" for i, k in enumerate(plan.keys)}
+
+
+def put_patterns(folder: Path, plan: PatternPlan, images: Iterable[tuple[str, FrameKey, AnyArray]]) -> dict[str, Any]:
+    """Writes what to project into an existing folder: `<camera>/NN.png` as the device needs them, and plan.json.
+
+    `images` are (camera, key, image). Returns plan.json, whose views are laid out as in capture.json.
+    """
+    names = {v.camera: _frame_names(v) for v in plan.views}
+    for camera in names:
+        (folder / camera).mkdir()
+    for camera, key, image in images:
+        write_png(folder / names[camera][key], image)
+    device = {"width": plan.projector_width, "height": plan.projector_height, "layout": plan.layout.value}
+    views = [
+        {"camera": v.camera, "pixel_format": v.pixel_format.value, "sets": _sets_document(v, names[v.camera])}
+        for v in plan.views
+    ]
+    doc = {"format": "fringescope-plan", "version": 1, "projector": device, "views": views}
+    files.write_json(folder / files.PLAN, doc)
+    return doc
+
+
+def check_rig(capture: Capture, rig: Rig) -> None:
+    """Refuses a capture that this rig cannot have taken. Raises RigError where it lacks a camera, else CaptureError."""
+    p = rig.projector
+    came = (capture.projector_width, capture.projector_height, capture.layout)
+    if came != (p.width, p.height, p.layout):
+        raise CaptureError(
+            f"{capture.document}: projector {came[0]} x {came[1]} {came[2].value}; the rig has {p.width} x {p.height} "
+            f'{p.layout.value}: use the rig of this instrument, or mend "projector"'
+        )
+    for v in capture.views:
+        lens = rig.camera(v.camera).lens
+        if v.size != (lens.width, lens.height):
+            raise CaptureError(
+                f"{capture.document}: frames of {v.camera} have {v.size[0]} x {v.size[1]} pixels; "
+                f"the rig's have {lens.width} x {lens.height}: use the rig of this instrument"
+            )
+
+
+def _put_view(folder: Path, view: ViewInput) -> dict[str, Any]:
+    plan = view.plan
+    keys, names = plan.keys, _frame_names(plan)
     (folder / plan.camera).mkdir()
     size: tuple[int, int] | None = None
     seen: set[FrameKey] = set()
@@ -297,20 +346,11 @@ def _put_view(folder: Path, view: ViewInput) -> dict[str, Any]:
     if len(seen) < len(keys):
         missing = [i for i, k in enumerate(keys) if k not in seen]
         raise CaptureError(f"view '{plan.camera}': {len(seen)} frames came, not {len(keys)}; missing {missing[:8]}")
-    entry: dict[str, Any] = {"camera": plan.camera, "pixel_format": plan.pixel_format.value, "sets": []}
-    for i, s in enumerate(plan.sets):
-        of = {(k.role, k.number): names[k] for k in keys if k.set_index == i}
-        if isinstance(s, FringeSet):
-            one: dict[str, Any] = {"cycles_per_pixel": list(s.cycles_per_pixel), "steps": s.steps,
-                                   "frames": [of[Role.STEP, n] for n in range(s.steps)]}
-            if s.exposure_us is not None:
-                one["exposure_us"] = s.exposure_us
-        else:
-            one = {"gray": s.axis, "cell": s.cell, "frames": [of[Role.BIT, n] for n in range(s.bits)]}
-            if s.inverse:
-                one["inverse"] = [of[Role.INVERSE, n] for n in range(s.bits)]
-            one |= {r.value: of[r, 0] for r in (Role.WHITE, Role.BLACK) if (r, 0) in of}
-        entry["sets"].append(one)
+    entry: dict[str, Any] = {
+        "camera": plan.camera,
+        "pixel_format": plan.pixel_format.value,
+        "sets": _sets_document(plan, names),
+    }
     if view.color is not None:
         entry["color"] = f"{plan.camera}/color.png"
         write_png(folder / entry["color"], check_frame(view.color, plan.pixel_format, size, entry["color"]))
@@ -319,9 +359,36 @@ def _put_view(folder: Path, view: ViewInput) -> dict[str, Any]:
     return entry
 
 
+def _sets_document(plan: ViewPlan, names: Mapping[FrameKey, str]) -> list[dict[str, Any]]:
+    out = []
+    for i, s in enumerate(plan.sets):
+        of = {(k.role, k.number): names[k] for k in plan.keys if k.set_index == i}
+        if isinstance(s, FringeSet):
+            one: dict[str, Any] = {
+                "cycles_per_pixel": list(s.cycles_per_pixel),
+                "steps": s.steps,
+                "frames": [of[Role.STEP, n] for n in range(s.steps)],
+            }
+            if s.exposure_us is not None:
+                one["exposure_us"] = s.exposure_us
+        else:
+            one = {"gray": s.axis, "cell": s.cell, "frames": [of[Role.BIT, n] for n in range(s.bits)]}
+            if s.inverse:
+                one["inverse"] = [of[Role.INVERSE, n] for n in range(s.bits)]
+            one |= {r.value: of[r, 0] for r in (Role.WHITE, Role.BLACK) if (r, 0) in of}
+        out.append(one)
+    return out
+
+
 def write_capture(
-    folder: Path | str, width: int, height: int, layout: Layout, views: Iterable[ViewInput],
-    *, force: bool = False, extra: Mapping[str, Any] | None = None,
+    folder: Path | str,
+    width: int,
+    height: int,
+    layout: Layout,
+    views: Iterable[ViewInput],
+    *,
+    force: bool = False,
+    extra: Mapping[str, Any] | None = None,
 ) -> None:
     """A new capture folder, whole or not at all: `new_folder` with `put_capture`. Raises OutputError, CaptureError."""
     with files.new_folder(folder, marker=files.CAPTURE, force=force) as tmp:

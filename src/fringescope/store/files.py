@@ -19,7 +19,7 @@ from typing import Any
 
 from fringescope.errors import FormatError, OutputError
 
-CAPTURE, SCAN, DECODED = "capture.json", "scan.json", "decoded.json"
+CAPTURE, SCAN, DECODED, PLAN = "capture.json", "scan.json", "decoded.json", "plan.json"
 
 _REASONS = {
     errno.ENOSPC: "the disk is full",
@@ -203,10 +203,10 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 def check_format(doc: Mapping[str, Any], path: Path, format_: str, version: int) -> None:
     """Refuses another `format` and a higher `version`. Raises FormatError."""
     if doc.get("format") != format_:
-        raise FormatError(f"{path}: \"format\" is {shown(doc.get('format'))}; needed \"{format_}\"")
+        raise FormatError(f'{path}: "format" is {shown(doc.get("format"))}; needed "{format_}"')
     v = doc.get("version")
     if isinstance(v, bool) or not isinstance(v, int) or v < 1:
-        raise FormatError(f"{path}: \"version\" is {shown(v)}; needed a whole number from 1 to {version}")
+        raise FormatError(f'{path}: "version" is {shown(v)}; needed a whole number from 1 to {version}')
     if v > version:
         raise FormatError(f"{path}: version {shown(v)} is higher than this program reads ({version}); update it")
 
@@ -236,7 +236,7 @@ def _numbers(value: Any) -> Any:
 
 
 def canonical_hash(doc: Mapping[str, Any]) -> str:
-    """"sha256:..." of a JSON object, whatever its white space, order of keys and spelling of numbers."""
+    """ "sha256:..." of a JSON object, whatever its white space, order of keys and spelling of numbers."""
     text = json.dumps(_numbers(doc), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return "sha256:" + hashlib.sha256(text.encode("ascii")).hexdigest()
 

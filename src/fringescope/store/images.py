@@ -39,7 +39,7 @@ class Header(NamedTuple):
 
 
 def split_page(name: str) -> tuple[str, int | None]:
-    """"file.tif#3" to ("file.tif", 3); any other name to (name, None)."""
+    """ "file.tif#3" to ("file.tif", 3); any other name to (name, None)."""
     m = _PAGE.match(name)
     return (m[1], int(m[2])) if m else (name, None)
 
@@ -142,7 +142,7 @@ class Images:
             if n == 0:
                 raise CaptureError(f"{path}: a TIFF without pages; needed a frame")
             if page is None and n > 1:
-                raise CaptureError(f"{path}: holds {n} pages; say which: \"{file}#0\" to \"{file}#{n - 1}\"")
+                raise CaptureError(f'{path}: holds {n} pages; say which: "{file}#0" to "{file}#{n - 1}"')
             if (page or 0) >= n:
                 raise CaptureError(f"{path}#{page}: the file has {n} pages (0 to {n - 1}); that page is missing")
             got = tif.pages[page or 0]
@@ -255,7 +255,7 @@ def check_header(head: Header, fmt: PixelFormat, size: tuple[int, int] | None, n
     need = 8 if fmt.bits <= 8 else 16
     if head.bits != need:
         came = f"{head.bits}-bit file"
-        raise CaptureError(f"{name}: {came}; {fmt.value} needs {need} bits: mend \"pixel_format\" or the file")
+        raise CaptureError(f'{name}: {came}; {fmt.value} needs {need} bits: mend "pixel_format" or the file')
     if head.channels not in (1, 3) or (fmt is PixelFormat.RGB8 and head.channels != 3):
         need_c = 3 if fmt is PixelFormat.RGB8 else 1
         raise CaptureError(f"{name}: {head.channels} channels; {fmt.value} needs {need_c}")
@@ -276,7 +276,7 @@ def check_frame(a: AnyArray, fmt: PixelFormat, size: tuple[int, int] | None, nam
         top = int(a.max())
         if top > fmt.max_value:
             shift = 16 - fmt.bits
-            hint = "mend \"pixel_format\" or the file"
+            hint = 'mend "pixel_format" or the file'
             if not (a & ((1 << shift) - 1)).any():
                 hint = f"they look left-aligned: shift them right by {shift} (`fringescope import --left-aligned`)"
             raise CaptureError(f"{name}: values up to {top}; {fmt.value} goes to {fmt.max_value}: {hint}")
@@ -298,6 +298,11 @@ def write_png(path: Path, a: AnyArray, level: int = 1) -> None:
 def write_tiff(path: Path, a: AnyArray) -> None:
     """(H, W) or (H, W, 3) float32 or integers as an uncompressed TIFF. Raises OSError if it cannot be written."""
     buf = io.BytesIO()
-    tifffile.imwrite(buf, a, photometric="rgb" if a.ndim == 3 and a.dtype == np.uint8 else "minisblack", metadata=None,
-                     planarconfig="contig" if a.ndim == 3 else None)
+    tifffile.imwrite(
+        buf,
+        a,
+        photometric="rgb" if a.ndim == 3 and a.dtype == np.uint8 else "minisblack",
+        metadata=None,
+        planarconfig="contig" if a.ndim == 3 else None,
+    )
     path.write_bytes(buf.getbuffer())

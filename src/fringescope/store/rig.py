@@ -62,11 +62,11 @@ def explain(e: ValidationError, path: Path) -> str:
 
 
 def parse_layout(name: str, path: Path) -> Layout:
-    """"grid" or "diamond". Raises FormatError."""
+    """ "grid" or "diamond". Raises FormatError."""
     try:
         return Layout(name)
     except ValueError:
-        raise FormatError(f"{path}: projector.layout is {files.shown(name)}; needed \"grid\" or \"diamond\"") from None
+        raise FormatError(f'{path}: projector.layout is {files.shown(name)}; needed "grid" or "diamond"') from None
 
 
 def read_rig(path: Path | str) -> Rig:
@@ -82,7 +82,7 @@ def read_rig(path: Path | str) -> Rig:
     except ValidationError as e:
         raise FormatError(explain(e, path)) from None
     if m.units != "mm":
-        raise RigError(f"{path}: units {files.shown(m.units)}; needed \"mm\"")
+        raise RigError(f'{path}: units {files.shown(m.units)}; needed "mm"')
     layout = parse_layout(m.projector.layout, path)
     where = "projector"
     try:
@@ -103,8 +103,6 @@ def read_rig(path: Path | str) -> Rig:
         return Rig(projector, tuple(cameras), volume, MappingProxyType(_extra(m)))
     except RigError as e:
         raise RigError(f"{path}: {where}: {e}") from None
-
-
 
 
 def _lens(d: _Device, width: int, height: int) -> Lens:
@@ -142,7 +140,9 @@ def rig_document(rig: Rig) -> dict[str, Any]:
 
     p = rig.projector
     doc: dict[str, Any] = {
-        "format": FORMAT, "version": VERSION, "units": "mm",
+        "format": FORMAT,
+        "version": VERSION,
+        "units": "mm",
         "projector": {"width": p.width, "height": p.height, "layout": p.layout.value, **device(p), **of_projector},
         "cameras": [
             {"name": c.name, "width": c.lens.width, "height": c.lens.height, **device(c), **of_cameras.get(c.name, {})}
@@ -163,5 +163,5 @@ def write_rig(path: Path | str, rig: Rig, *, force: bool = False) -> None:
 
 
 def hash_rig(path: Path | str) -> str:
-    """"sha256:..." of a rig's file, whatever its white space and the order of its keys. Raises FormatError."""
+    """ "sha256:..." of a rig's file, whatever its white space and the order of its keys. Raises FormatError."""
     return files.canonical_hash(files.read_json(Path(path), "a rig"))

@@ -9,12 +9,11 @@ import dataclasses
 import datetime
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from fringescope import __version__
@@ -92,20 +91,22 @@ def put_scan(
     write_glb: WriteGlb,
     times_s: Mapping[str, float] | None = None,
     grids: bool = False,
-    all_points: Cloud | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Writes a scan into an existing folder and returns its scan.json.
 
-    `all_points` takes the place of the fused cloud in cloud.ply. `grids` writes the organised grids as TIFF and PNG,
-    otherwise they lie as .npy. `extra` adds keys to scan.json. "hash" identifies the scan: sha256 over the hashes of
-    capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
+    `scan.all_points`, where there is one, takes the place of the fused cloud in cloud.ply. `grids` writes the organised
+    grids as TIFF and PNG, otherwise they lie as .npy. `extra` adds keys to scan.json. "hash" identifies the scan: sha256
+    over the hashes of capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
     """
-    cloud = scan.cloud if all_points is None else all_points
+    cloud = scan.cloud if scan.all_points is None else scan.all_points
     write_ply(cloud, folder / "cloud.ply")
     identity = {
-        "capture": capture_hash, "rig": rig_hash, "settings": plain(settings),
-        "software": __version__, "cloud": _sha256(folder / "cloud.ply"),
+        "capture": capture_hash,
+        "rig": rig_hash,
+        "settings": plain(settings),
+        "software": __version__,
+        "cloud": _sha256(folder / "cloud.ply"),
     }
     hash_ = files.canonical_hash(identity)
     if scan.surface is not None:
@@ -124,9 +125,12 @@ def put_scan(
         "capture": capture_hash,
         "rig": rig_hash,
         "units": "mm",
-        "cloud": {"points": len(cloud), "kind": "fused" if all_points is None else "all-points"},
-        "surface": None if scan.surface is None else {
-            "vertices": len(scan.surface.vertices), "triangles": scan.surface.n_faces,
+        "cloud": {"points": len(cloud), "kind": "fused" if scan.all_points is None else "all-points"},
+        "surface": None
+        if scan.surface is None
+        else {
+            "vertices": len(scan.surface.vertices),
+            "triangles": scan.surface.n_faces,
             "textures": [list(p.texture.shape[1::-1]) for p in scan.surface.parts],
         },
         "grids": "tif" if grids else "npy",
@@ -179,7 +183,7 @@ def read_scan(folder: Path | str, *, grids: bool = True, check: bool = True) -> 
     folder = path.parent
     listed = doc.get("files")
     if not isinstance(listed, dict) or not isinstance(doc.get("views"), list):
-        raise FormatError(f"{path}: needed \"files\" and \"views\"")
+        raise FormatError(f'{path}: needed "files" and "views"')
     for name, digest in listed.items():
         if files.check_relative(name) is not None or not (folder / name).is_file():
             raise FormatError(f"{folder}: {files.shown(name)} is missing; scan.json lists it: copy the whole folder")
@@ -219,39 +223,53 @@ def put_decoded(
     *,
     settings: Mapping[str, Any],
     capture_hash: str,
+    pictures: Callable[[Decoded], Mapping[str, U8]] | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Writes decoded views, each with its projector coordinates (u, v), into an existing folder; returns decoded.json.
 
-    Per camera: phase_0.tif .. (one per direction, absolute radians), modulation, background, u, v (float32, NaN =
-    none), reasons.png (16 bits), and for people preview-*.png of each.
+    Per camera: phase_0.tif .. (one per direction, absolute radians) and u, v, NaN wherever a reason is set; modulation,
+    background (all float32), reasons.png (16 bits); and preview-NAME.png of what `pictures` draws for people.
     """
     entries = []
     for d, u, v in views:
         sub = folder / d.camera
         sub.mkdir()
-        layers = {f"phase_{i}": x.phase for i, x in enumerate(d.directions)}
-        layers |= {"modulation": d.modulation, "background": d.background, "u": u, "v": v}
+        lines = {f"phase_{i}": x.phase for i, x in enumerate(d.directions)} | {"u": u, "v": v}
+        layers = {n: np.where(d.reasons == 0, a, np.float32(np.nan)) for n, a in lines.items()}
+        layers |= {"modulation": d.modulation, "background": d.background}
         for name, a in layers.items():
             write_tiff(sub / f"{name}.tif", np.asarray(a, np.float32))
-            image = phase_picture(a) if name.startswith("phase") else picture(a, grey=name == "background")
-            write_png(sub / f"preview-{name}.png", image, 4)
         write_png(sub / "reasons.png", np.asarray(d.reasons, np.uint16))
-        write_png(sub / "preview-reasons.png", reasons_picture(d.reasons), 4)
-        entries.append({
-            "camera": d.camera,
-            "size": list(d.shape[::-1]),
-            "directions": [{"cycles_per_pixel": list(x.g), "file": f"phase_{i}.tif",
-                            "valid": int(np.isfinite(x.phase).sum())} for i, x in enumerate(d.directions)],
-            "pixels": int(d.reasons.size),
-            "valid": int((d.reasons == 0).sum()),
-            "lost": lost(d.reasons),
-            "noise": plain(d.noise),
-        })
+        for name, image in (pictures(d) if pictures else {}).items():
+            write_png(sub / f"preview-{name}.png", image, 4)
+        entries.append(
+            {
+                "camera": d.camera,
+                "size": list(d.shape[::-1]),
+                "directions": [
+                    {
+                        "cycles_per_pixel": list(x.g),
+                        "file": f"phase_{i}.tif",
+                        "valid": int((np.isfinite(x.phase) & (d.reasons == 0)).sum()),
+                    }
+                    for i, x in enumerate(d.directions)
+                ],
+                "pixels": int(d.reasons.size),
+                "valid": int((d.reasons == 0).sum()),
+                "lost": lost(d.reasons),
+                "noise": plain(d.noise),
+            }
+        )
     doc = {
-        "format": DECODED_FORMAT, "version": DECODED_VERSION,
-        "software": {"name": "fringescope", "version": __version__}, "created": _now(),
-        "capture": capture_hash, "views": entries, "settings": plain(settings), **plain(extra or {}),
+        "format": DECODED_FORMAT,
+        "version": DECODED_VERSION,
+        "software": {"name": "fringescope", "version": __version__},
+        "created": _now(),
+        "capture": capture_hash,
+        "views": entries,
+        "settings": plain(settings),
+        **plain(extra or {}),
     }
     files.write_json(folder / files.DECODED, doc)
     return doc
@@ -268,51 +286,3 @@ def write_decoded(
 def lost(reasons: U16) -> dict[str, int]:
     """Pixels per reason, by its label; a pixel may count under several."""
     return {r.label: n for r in Reason if (n := int(np.count_nonzero(reasons & np.uint16(r.value))))}
-
-
-# ----------------------------------------------------------------------------------------------------------- pictures
-
-
-def picture(a: F32, *, grey: bool = False) -> U8:
-    """(H, W) to RGB, 1st to 99th percentile; NaN is dark red in grey pictures, black in coloured ones."""
-    ok = np.isfinite(a)
-    low, high = (np.percentile(a[ok], (1, 99)) if ok.any() else (0.0, 1.0))
-    x = np.clip((np.where(ok, a, low) - low) / max(float(high - low), 1e-9), 0, 1)
-    x8 = np.asarray(np.rint(255 * x), np.uint8)
-    rgb: U8 = np.repeat(x8[..., None], 3, axis=2) if grey else _colours(x8, cv2.COLORMAP_VIRIDIS)
-    rgb[~ok] = (60, 0, 0) if grey else 0
-    return rgb
-
-
-def phase_picture(phase: F32) -> U8:
-    """Absolute phase (H, W) to RGB: the hue turns once per fringe, brightness grows with the phase; NaN is black."""
-    ok = np.isfinite(phase)
-    if not ok.any():
-        return np.zeros((*phase.shape, 3), np.uint8)
-    p = np.where(ok, phase, 0.0)
-    low, high = float(p[ok].min()), float(p[ok].max())
-    hue = np.asarray(np.mod(p / (2 * np.pi), 1) * 255, np.uint8)
-    rgb = _colours(hue, cv2.COLORMAP_TWILIGHT)
-    ramp = 0.35 + 0.65 * (p - low) / max(high - low, 1e-9)
-    out: U8 = np.asarray(rgb * np.where(ok, ramp, 0.0)[..., None], np.uint8)
-    return out
-
-
-_REASON_RGB: Sequence[tuple[int, int, int]] = (
-    (40, 40, 60), (255, 255, 0), (90, 60, 120), (230, 80, 30), (0, 200, 230), (220, 0, 160),
-    (0, 120, 255), (140, 90, 40), (255, 0, 0), (120, 255, 80), (255, 170, 200),
-)
-
-
-def reasons_picture(reasons: U16) -> U8:
-    """Reason bits (H, W) to RGB: valid pixels light grey, others in the colour of their lowest bit."""
-    out = np.full((*reasons.shape, 3), 225, np.uint8)
-    for r, rgb in reversed(list(zip(Reason, _REASON_RGB, strict=True))):
-        out[(reasons & np.uint16(r.value)) != 0] = rgb
-    return out
-
-
-def _colours(x: U8, table: int) -> U8:
-    bgr = cv2.applyColorMap(x, table)
-    out: U8 = np.ascontiguousarray(bgr[..., ::-1])
-    return out

@@ -1,0 +1,280 @@
+"""Verbs from a capture to a surface and what it is worth: reconstruct, decode, evaluate, export."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from fringescope.cli.app import app
+from fringescope.cli.common import (
+    Force,
+    Json,
+    Out,
+    Progress,
+    SetOption,
+    SettingsFile,
+    emit,
+    existing,
+    load_settings,
+    numbers,
+    pixel_format,
+)
+from fringescope.errors import UsageError
+
+if TYPE_CHECKING:
+    from fringescope.evaluate import Evaluation
+    from fringescope.settings import Settings
+    from fringescope.types import U8, Cloud, Decoded, Scan, ViewInput
+
+
+# --------------------------------------------------------------------------------------------------------- reconstruct
+
+
+def scan_into(
+    folder: Path,
+    capture: Path,
+    rig: Path,
+    s: Settings,
+    progress: Progress,
+    *,
+    grids: bool = False,
+    all_points: bool = False,
+    preview: bool = True,
+) -> tuple[Scan, dict[str, Any]]:
+    """Reconstructs a capture and writes the scan into a folder that is being made; returns it with its scan.json."""
+    from fringescope import export, pipeline, store
+    from fringescope.settings import to_dict
+
+    c = store.read_capture(capture)
+    r = store.read_rig(rig)
+    store.check_rig(c, r)
+    scan = pipeline.scan(store.view_inputs(c), r, s, all_points=all_points, progress=progress.share)
+    if preview and scan.preview is not None:
+        page = export.viewer_page(scan.preview, title=folder_title(capture))
+        (folder / "view.html").write_text(page, encoding="utf-8")
+    doc = progress.run(
+        "writing",
+        lambda: store.put_scan(
+            folder,
+            scan,
+            settings=to_dict(s),
+            capture_hash=store.hash_capture(c),
+            rig_hash=store.hash_rig(rig),
+            write_ply=export.write_ply,
+            write_glb=export.write_glb,
+            times_s=progress.times_s,
+            grids=grids,
+        ),
+    )
+    return scan, doc
+
+
+def folder_title(path: Path) -> str:
+    """A name for people: that of the folder."""
+    return (path.parent if path.is_file() else path).resolve().name
+
+
+def scan_summary(doc: dict[str, Any], out: Path) -> list[str]:
+    """A scan in lines for people: what there is, and what each view lost and why."""
+    surface = doc["surface"]
+    lines = [f"{out}: {doc['cloud']['points']} points" + (f", {surface['triangles']} triangles" if surface else "")]
+    for v in doc["views"]:
+        lines += list(v.get("words", ()))
+    return lines
+
+
+@app.command()
+def reconstruct(
+    capture: Annotated[Path, typer.Argument(help="A capture: a folder with capture.json.")],
+    rig: Annotated[Path, typer.Option(help="The rig.json of this instrument.")],
+    out: Out,
+    all_points: Annotated[
+        bool, typer.Option("--all-points", help="cloud.ply holds every valid pixel of every view.")
+    ] = False,
+    grids: Annotated[
+        bool, typer.Option("--grids", help="Also write the organised points as TIFF, the reasons as PNG.")
+    ] = False,
+    preview: Annotated[bool, typer.Option(help="Also write view.html, which shows the surface in a browser.")] = True,
+    settings: SettingsFile = None,
+    set_: SetOption = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Fringe images to a clean, coloured, fused surface: scan.json, cloud.ply, surface.glb."""
+    from fringescope import store
+
+    s = load_settings(settings, set_)
+    with store.new_folder(out, marker="scan.json", force=force) as tmp, Progress() as progress:
+        _, doc = scan_into(tmp, capture, rig, s, progress, grids=grids, all_points=all_points, preview=preview)
+    emit({"scan": str(out), **doc}, json, scan_summary(doc, out))
+
+
+# -------------------------------------------------------------------------------------------------------------- decode
+
+
+def _pictures(d: Decoded) -> dict[str, U8]:
+    """What people look at: phase, modulation and background in colour, reasons with a legend."""
+    from fringescope import report
+
+    out = {f"phase_{i}": report.phase_picture(x.phase, d.reasons == 0) for i, x in enumerate(d.directions)}
+    for name, a in (("modulation", d.modulation), ("background", d.background)):
+        top = max(float(np.nanpercentile(a, 99.5)), 1e-6)
+        out[name] = np.asarray(255 * np.clip(np.nan_to_num(a) / top, 0, 1), np.uint8)
+    return out | {"reasons": report.reasons_map(d.reasons, d.camera, d.background)}
+
+
+@app.command()
+def decode(
+    capture: Annotated[
+        Path, typer.Argument(metavar="CAPTURE_OR_STACK", help="A capture folder, or a TIFF stack of one set.")
+    ],
+    out: Out,
+    steps: Annotated[
+        str | None, typer.Option(help="Of a stack: number of steps (default: all along the axis).")
+    ] = None,
+    axis: Annotated[str | None, typer.Option(help="Of a stack: the axis along which the steps lie, as Z.")] = None,
+    time: Annotated[int | None, typer.Option(help="Of a stack: which time.")] = None,
+    pixel_format_: Annotated[str | None, typer.Option("--pixel-format", help="Of a stack: as Mono12.")] = None,
+    settings: SettingsFile = None,
+    set_: SetOption = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Phase, modulation, background, projector coordinates and reasons per pixel, without a rig.
+
+    A bare stack has no period: it is decoded as one fringe, so its phase is wrapped.
+    """
+    from fringescope import importing, phase, pipeline, store
+    from fringescope.settings import from_dict, to_dict
+
+    s = load_settings(settings, set_)
+    existing(capture, "a capture folder or a TIFF stack")
+    with store.new_folder(out, marker="decoded.json", force=force) as tmp, Progress() as progress:
+        views: Sequence[ViewInput]
+        extra: dict[str, Any] = {}
+        if capture.is_file() and capture.suffix.lower() in (".tif", ".tiff"):
+            n = None if steps is None else numbers(steps, "--steps", int)[0]
+            view, note, digest = importing.stack_view(capture, n, axis, time, pixel_format(pixel_format_))
+            views, extra = (view,), {"source": capture.name, "note": note}
+            s = from_dict({"denoise": {"jump_floor_rad": 7.0}}, s)  # a wrapped phase jumps by design
+        elif (steps, axis, time, pixel_format_) != (None,) * 4:
+            raise UsageError("--steps, --axis, --time, --pixel-format are for a TIFF stack; a capture says them itself")
+        else:
+            c = store.read_capture(capture)
+            views, digest = store.view_inputs(c), ""
+        decoded = []
+        for v in progress.track(views, "decoding", len(views)):
+            d = pipeline.decode_view(v, s)
+            nowhere = np.full(d.shape, np.nan, np.float32)
+            decoded.append((d, *((nowhere, nowhere) if extra else phase.projector_coordinates(d))))
+        digest = digest or store.hash_capture(c)
+        doc = progress.run(
+            "writing",
+            lambda: store.put_decoded(
+                tmp, decoded, settings=to_dict(s), capture_hash=digest, pictures=_pictures, extra=extra
+            ),
+        )
+    lines = [f"{out}: {len(doc['views'])} view(s)"] + ([extra["note"]] if extra else [])
+    for view in doc["views"]:
+        share = 100 * view["valid"] / max(view["pixels"], 1)
+        lost = ", ".join(f"{n} {r}" for r, n in view["lost"].items())
+        lines.append(
+            f"{view['camera']}: {view['valid']} pixels decoded ({share:.0f} %)" + (f"; lost: {lost}" if lost else "")
+        )
+    emit({"decoded": str(out), **doc}, json, lines)
+
+
+# ------------------------------------------------------------------------------------------------- evaluate and export
+
+
+def read_cloud(path: Path) -> Cloud:
+    """The points of a scan's folder or of a PLY. Raises FormatError, CaptureError."""
+    from fringescope import export, store
+
+    existing(path, "a scan folder or a PLY file")
+    if path.is_dir() or path.name == "scan.json":
+        return export.read_ply(store.read_scan(path, grids=False).cloud)
+    return export.read_ply(path)
+
+
+@app.command()
+def evaluate(
+    scan: Annotated[Path, typer.Argument(metavar="SCAN_OR_PLY", help="A scan folder, or a PLY.")],
+    fit: Annotated[str, typer.Option(help="plane, or sphere (all spheres and their base).")],
+    radius: Annotated[str | None, typer.Option(help="Nominal radii of spheres in mm, as in 12,5.")] = None,
+    band: Annotated[float | None, typer.Option(help="Farther than this from the form (mm) a point flies.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="With it the sigma of points is judged along the cameras' rays.")
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Write a PNG of the error map.")] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Fits a plane or spheres and tells how good the points are, as in section IV of the paper."""
+    from fringescope import evaluate as ev
+    from fringescope import geometry, report, store
+
+    radii = numbers(radius, "--radius", float) if radius else ()
+    cloud = read_cloud(scan)
+    centres = None
+    if rig is not None:
+        centres = np.stack([geometry.centre(c.pose) for c in store.read_rig(rig).cameras])
+    has_sigma = bool(np.isfinite(cloud.sigma).any())
+    with Progress() as progress:
+        found = progress.run(
+            "fitting",
+            lambda: ev.evaluate(
+                cloud.xyz, fit, radii, cloud.sigma if has_sigma else None, cloud.view, centres, band or ev.BAND_MM
+            ),
+        )
+        if picture is not None:
+            with store.new_file(picture, force=force) as tmp:
+                store.write_png(tmp, progress.run("drawing", lambda: _error_maps(found, scan.name)))
+    doc = found.to_dict()
+    emit({"source": str(scan), **doc}, json, _evaluation(doc))
+
+
+def _error_maps(found: Evaluation, name: str) -> U8:
+    """The plane's error map, or one of each sphere, one below the other."""
+    from fringescope import report
+
+    forms = (
+        [("plane", found.plane)]
+        if found.kind == "plane"
+        else [(f"sphere {i + 1}, radius {s.radius_mm:.3f} mm", s) for i, s in enumerate(found.spheres)]
+    )
+    maps = []
+    for what, form in forms:
+        if form is None:
+            continue
+        error = np.where(form.own, 1000 * form.error_mm, np.nan)
+        s = form.spread
+        figures = [("std", f"{s.std_um:.2f} um"), ("rms", f"{s.rms_um:.2f} um"), ("points", f"{s.points:,}")]
+        maps.append(report.error_map(form.flat_mm, error, f"{name}: {what}", figures))
+    width = max(m.shape[1] for m in maps)
+    padded = [np.pad(m, ((0, 0), (0, width - m.shape[1]), (0, 0)), constant_values=255) for m in maps]
+    return np.concatenate(padded, axis=0)
+
+
+def _evaluation(doc: dict[str, Any]) -> list[str]:
+    lines = [f"{doc['points']} points, {doc['flying_ppm']:.0f} ppm flying (farther than {doc['band_mm']:g} mm)"]
+
+    def spread(d: dict[str, Any]) -> str:
+        return ", ".join(
+            f"{k.removesuffix('_um')} {v:.2f} um" for k, v in d.items() if k.endswith("_um") and v is not None
+        )
+
+    for name, form in (("plane", doc["plane"]), *((f"sphere {i + 1}", s) for i, s in enumerate(doc["spheres"]))):
+        if form:
+            radius = f"radius {form['radius_mm']:.4f} mm, " if "radius_mm" in form else ""
+            lines.append(
+                f"{name}: {radius}{spread(form)}" + (f", {spread(form['spread'])}" if "spread" in form else "")
+            )
+    lines += [f"centres of spheres {i + 1} and {j + 1}: {d:.4f} mm" for i, j, d in doc["center_distances_mm"]]
+    if doc["sigma_ratio"] is not None:
+        lines.append(f"error over sigma: {doc['sigma_ratio']:.2f} (1: the uncertainty is calibrated)")
+    return lines
