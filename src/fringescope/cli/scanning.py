@@ -216,7 +216,7 @@ def evaluate(
 ) -> None:
     """Fits a plane or spheres and tells how good the points are, as in section IV of the paper."""
     from fringescope import evaluate as ev
-    from fringescope import geometry, report, store
+    from fringescope import geometry, store
 
     radii = numbers(radius, "--radius", float) if radius else ()
     cloud = read_cloud(scan)

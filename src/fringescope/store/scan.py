@@ -96,7 +96,7 @@ def put_scan(
     """Writes a scan into an existing folder and returns its scan.json.
 
     `scan.all_points`, where there is one, takes the place of the fused cloud in cloud.ply. `grids` writes the organised
-    grids as TIFF and PNG, otherwise they lie as .npy. `extra` adds keys to scan.json. "hash" identifies the scan: sha256
+    grids as TIFF and PNG, else as .npy. `extra` adds keys to scan.json. "hash" identifies the scan: sha256
     over the hashes of capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
     """
     cloud = scan.cloud if scan.all_points is None else scan.all_points
