@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -268,3 +271,26 @@ def test_repeatability_refuses_what_does_not_belong_together():
     dark = dataclasses.replace(g[1], reasons=np.ones_like(g[1].reasons))
     with pytest.raises(EmptyResultError, match="valid in all"):
         ev.repeatability([g[0], dark])
+
+
+JUDGE = Path(__file__).resolve().parents[2] / "shared" / "tools" / "score.py"
+
+
+@pytest.mark.skipif(not JUDGE.exists(), reason="the judge ../shared/tools/score.py is not here")
+def test_figures_are_those_of_the_judge(tmp_path):
+    """An independent program takes the same figures of the same cloud."""
+    rng = np.random.default_rng(20)
+    p = plane_cloud(rng, 150_000, 0.0048, flying=0.001).astype(np.float32)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(p)}\n"
+    header += "".join(f"property float {a}\n" for a in "xyz") + "end_header\n"
+    (tmp_path / "cloud.ply").write_bytes(header.encode() + p.tobytes())
+    truth = {"normal": NORMAL.tolist(), "point": (5 * NORMAL).tolist()}
+    (tmp_path / "plane.json").write_text(json.dumps(truth))
+    command = [sys.executable, str(JUDGE), str(tmp_path / "cloud.ply"), str(tmp_path / "plane.json"), "--json"]
+    judged = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    ours = ev.measure_plane(p, 5 * NORMAL, NORMAL)
+    for name in ("bias_um", "std_um", "rms_um", "p99_um"):
+        assert getattr(ours.spread, name) == pytest.approx(judged[name], abs=0.002)
+    assert ours.inliers == judged["good"]
+    assert ours.flying_ppm == pytest.approx(judged["flying_ppm"])
+    assert ours.form_um == pytest.approx(judged["form_um"], abs=0.1)  # tiles lie elsewhere
