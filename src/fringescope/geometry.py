@@ -6,9 +6,11 @@ b to a. Lens model: OpenCV, "Camera Calibration and 3D Reconstruction"; equation
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from fringescope.errors import RigError
 from fringescope.kernels import lens as k
@@ -133,48 +135,48 @@ def measuring_space(rig: Rig, camera: Camera, p_world: ArrayLike, margin: float)
     """Whether world points (..., 3) may carry a specimen seen by `camera`.
 
     Inside the rig's volume, grown by `margin` (1.25 = a quarter larger), where the rig has one; else seen by projector
-    and camera, within 25 % of the working distance, and in the slab of heights that all devices see in common.
+    and camera, in the slab of depths where the devices' fields overlap (see `common_depths`).
     """
     p = np.asarray(p_world, dtype=np.float64)
     if rig.volume is not None:
         v = rig.volume
         return inside_volume(Volume(v.center, v.axes, v.half_size * margin), p)
-    only = Rig(rig.projector, (camera,))
-    ok = field_of_view(only, p)
-    mid, axis = working_point(rig), _looking(rig)
-    near, far = _common_slab(rig, mid, axis)
-    h = (p - mid) @ axis
-    return np.asarray(ok & (h >= near) & (h <= far))
+    near, far = common_depths(rig, camera)
+    z = transform(camera.pose, p)[..., 2]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(field_of_view(Rig(rig.projector, (camera,)), p) & (z >= near) & (z <= far))
 
 
-def _looking(rig: Rig) -> F64:
-    """Unit vector (3,) along which the devices look on the average, world."""
-    a = np.sum([d.pose.R[2] for d in rig.devices], axis=0)
-    return np.asarray(a / np.linalg.norm(a))
+@lru_cache(maxsize=64)
+def common_depths(rig: Rig, camera: Camera) -> tuple[float, float]:
+    """Depths along a camera's axis, mm, between which all devices of the rig share some of their fields.
 
-
-def _common_slab(rig: Rig, mid: F64, axis: F64) -> tuple[float, float]:
-    """Heights along `axis` from `mid` at which some point is seen by all devices, at most 25 % of the distance."""
-    reach = 0.25 * float(np.mean([np.linalg.norm(centre(d.pose) - mid) for d in rig.devices]))
-    heights = np.linspace(-reach, reach, 101)
-    side = np.linalg.svd(np.eye(3) - np.outer(axis, axis))[0][:, :2].T
-    width = max(2 * np.linalg.norm(centre(d.pose) - mid) * d.lens.width / d.lens.K[0, 0] for d in rig.devices)
-    a = np.linspace(-width / 2, width / 2, 41)
-    plane = (a[:, None, None] * side[0] + a[None, :, None] * side[1]).reshape(-1, 3)
-    seen = [bool(field_of_view(rig, mid + h * axis + plane).any()) for h in heights]
-    if not any(seen):
-        raise RigError("projector and cameras share no view within 25 % of the working distance; check the poses")
-    ok = heights[np.array(seen)]
-    return float(ok.min()), float(ok.max())
+    They share where at least a tenth of the best share of this camera's rays is seen by all. Looks from a twentieth to
+    twenty times the distance between the devices. Raises RigError if there is no common view.
+    """
+    base = max(float(np.linalg.norm(centre(d.pose) - centre(camera.pose))) for d in rig.devices)
+    L = camera.lens
+    v, u = np.meshgrid(np.linspace(0, L.height - 1, 15), np.linspace(0, L.width - 1, 15), indexing="ij")
+    n = unproject(L, np.stack([u, v], -1))
+    rays = np.concatenate([n, np.ones((15, 15, 1))], -1)
+    depths = np.geomspace(base / 20, base * 20, 241)
+    back = inverse(camera.pose)
+    share = np.array([float(field_of_view(rig, transform(back, rays * z)).mean()) for z in depths])
+    if not share.any():
+        raise RigError(f"camera '{camera.name}' and the other devices of the rig share no view; check the poses")
+    ok = depths[share >= 0.1 * share.max()]
+    return float(ok.min() * 0.97), float(ok.max() * 1.03)
 
 
 def phase_bounds(
     rig: Rig, camera: Camera, g: tuple[float, float], margin: float, size: tuple[int, int] = (18, 26)
-) -> tuple[F64, F64]:
-    """Smallest and largest phase of gradient `g` that each ray of a camera can meet inside the measuring space.
+) -> F64:
+    """Bounds of the phase of gradient `g` on each ray of a camera: an array (4, h, w), radians.
 
-    Returns two arrays of `size` (h, w) that span the image corner on corner, radians. Rays that miss the space take
-    the bounds of the nearest ray that meets it. Raises RigError if none does.
+    [0] and [1]: smallest and largest phase inside the measuring space. [2] and [3]: the same within 25 % of the working
+    distance, where a specimen is to be expected if the rig has no volume (with a volume: equal to the first two).
+    The arrays span the image corner on corner; rays that miss a space take the bounds of the nearest ray that meets it.
+    Raises RigError if none does.
     """
     h, w = size
     L = camera.lens
@@ -183,24 +185,38 @@ def phase_bounds(
     if rig.volume is not None:
         distance = float(np.linalg.norm(rig.volume.center - origin))
         reach = margin * float(np.linalg.norm(rig.volume.half_size))
+        t = np.linspace(max(distance - reach, 1e-3 * distance), distance + reach, 257)
     else:
         distance = float(np.linalg.norm(working_point(rig) - origin))
-        reach = 0.5 * distance
-    t = np.linspace(max(distance - reach, 1e-3 * distance), distance + reach, 257)
+        near, far = common_depths(rig, camera)
+        t = np.geomspace(near, 1.1 * far, 513)
     p = origin + d[:, :, None, :] * t[:, None]
-    ok = measuring_space(rig, camera, p, margin)
     phi = phase_at(rig.projector, g, p)
-    step = np.abs(np.diff(phi, axis=2)).max(axis=2)
-    ok &= np.isfinite(phi)
-    low = np.where(ok, phi, np.inf).min(axis=2) - step
-    high = np.where(ok, phi, -np.inf).max(axis=2) + step
-    missed = ~ok.any(axis=2)
+    ok = measuring_space(rig, camera, p, margin) & np.isfinite(phi)
+    low, high = _extremes(phi, ok, camera.name)
+    if rig.volume is not None:
+        return np.stack([low, high, low, high])
+    expected = ok & (np.abs(t - distance) < 0.25 * distance)
+    return np.stack([low, high, *(_extremes(phi, expected, camera.name) if expected.any() else (low, high))])
+
+
+def _extremes(phi: F64, ok: Bool, name: str) -> tuple[F64, F64]:
+    """Smallest and largest of `phi` (h, w, n) where `ok`, grown to the neighbours' extremes; holes filled from nearby."""
+    step = np.where(ok[..., 1:] & ok[..., :-1], np.abs(np.diff(phi, axis=2)), 0.0).max(axis=2)
+    low = np.where(ok, phi, np.inf).min(axis=2)
+    high = np.where(ok, phi, -np.inf).max(axis=2)
+    with np.errstate(invalid="ignore"):
+        grow = step + 0.01 * (high - low)
+        low, high = low - grow, high + grow
+    missed = np.asarray(~ok.any(axis=2))
     if missed.all():
-        raise RigError(f"camera '{camera.name}' and the projector share no view in the measuring volume; check the rig")
+        raise RigError(f"camera '{name}' and the projector share no view in the measuring volume; check the rig")
     if missed.any():
-        near = np.asarray(distance_transform_edt(missed.astype(np.uint8), return_distances=False, return_indices=True))
-        low, high = low[near[0], near[1]], high[near[0], near[1]]
-    return np.ascontiguousarray(low), np.ascontiguousarray(high)
+        there = np.argwhere(~missed)
+        for a, b in np.argwhere(missed):
+            c, e = there[np.argmin(((there - (a, b)) ** 2).sum(1))]
+            low[a, b], high[a, b] = low[c, e], high[c, e]
+    return np.asarray(minimum_filter(low, 3)), np.asarray(maximum_filter(high, 3))
 
 
 def epipolar_field(rig: Rig, camera: Camera, g: tuple[float, float], size: tuple[int, int] = (18, 26)) -> F64:

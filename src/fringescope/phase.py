@@ -429,7 +429,7 @@ def settle_order(
         gray, half, soft = _gray_phase(decoded.gray, g, used)
         if rig is None:
             lo, hi = field_bounds(g, plan.projector_size)
-            low, high = np.full((2, 2), lo), np.full((2, 2), hi)
+            bounds = np.broadcast_to(np.array([lo, hi, lo, hi])[:, None, None], (4, 2, 2)).copy()
             span = unambiguous_span(group, 4 * s.systematic_rad)
             field = (hi - lo) / (2 * math.pi * math.hypot(*g))
             if gray is None and span < 0.7 * field:
@@ -438,8 +438,8 @@ def settle_order(
                     f"units, the field is {field:.0f}; add a coarser period or a Gray code, or give a rig"
                 )
         else:
-            low, high = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
-        direction, bad = _unwrap(group, low, high, gray, half, soft, s)
+            bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
+        direction, bad = _unwrap(group, bounds, gray, half, soft, s)
         out.append(direction)
         reasons |= bad
     for i, code in enumerate(decoded.gray):
@@ -451,7 +451,7 @@ def settle_order(
 
 
 def _unwrap(
-    group: Sequence[WrappedSet], low: F64, high: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
+    group: Sequence[WrappedSet], bounds: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
 ) -> tuple[Direction, U16]:
     phases = np.stack([w.phase for w in group])
     sigmas = np.stack([np.hypot(w.sigma, np.float32(s.systematic_rad)) for w in group])
@@ -459,7 +459,8 @@ def _unwrap(
     shape = phases.shape[1:]
     absolute, margin = np.empty(shape, np.float32), np.empty(shape, np.float32)
     none = np.zeros((0, 0), np.float32)
-    k.unwrap(phases, sigmas, freq, low, high, none if gray is None else gray, half, soft, absolute, margin)
+    unexpected = s.unexpected_sigma**2
+    k.unwrap(phases, sigmas, freq, bounds, unexpected, none if gray is None else gray, half, soft, absolute, margin)
     uncertain = ~(margin >= s.order_min_margin)
     if s.order_votes > 1:
         trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)

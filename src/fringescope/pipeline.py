@@ -15,7 +15,7 @@ import numpy as np
 from fringescope import denoise, fuse, phase, triangulate
 from fringescope.errors import EmptyResultError
 from fringescope.settings import Settings
-from fringescope.types import Decoded, Grid, Photo, Rig, Scan, ViewInput
+from fringescope.types import Decoded, Grid, Photo, Rig, Scan, Surface, ViewInput
 
 Progress = Callable[[str, float], None]  #: called with what is being done and the share that is done, 0 to 1
 
@@ -99,7 +99,7 @@ def scan(
     cloud = fuse.cloud(fused)
     every = fuse.all_points(grids, photos, rig, s.fuse) if all_points else None
     times["fuse"] = perf_counter() - start
-    levels = ()
+    levels: tuple[Surface, ...] = ()
     if surface:
         tell("meshing", 0.85)
         start = perf_counter()

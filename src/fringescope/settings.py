@@ -51,6 +51,7 @@ class PhaseSettings(_Section):
 
     systematic_rad: float = knob(0.05, "rad", "phase error that noise does not explain (response, defocus); added to sigma when orders are weighed", "II-C", 0, 1)
     order_min_margin: float = knob(3.0, "sigma", "an order is uncertain if the next one fits less than this many standard deviations worse", "II-C", 0)
+    unexpected_sigma: float = knob(4.0, "sigma", "what it costs an order to lie beyond 25 % of the working distance, in a rig without a measuring volume", "II-C", 0)
     order_votes: int = knob(5, "pixels", "side of the window in which neighbours vote on a pixel's order; 1 = no vote", "II-C", 1, 31)
     order_majority: float = knob(0.7, "", "share of the votes that repairs an order", "II-C", 0.5, 1)
     max_sigma_rad: float = knob(0.5, "rad", "pixels whose phase is noisier than this do not vote on orders", "II-C", 0)

@@ -179,11 +179,11 @@ def _chain(phases, sigmas, freq, i, j, first, order):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, margin):
+def unwrap(phases, sigmas, freq, bounds, unexpected, gray, gray_half, gray_soft, out, margin):
     """Absolute phase of the finest of K parallel sets (K, H, W), coarse to fine, by least chi squared (equation 5).
 
-    Every order of the coarsest set is tried whose finest phase lies in [low, high] of its pixel (arrays (h, w) that are
-    spread over the image bilinearly, corner on corner). Residuals of the finer sets decide (excess fractions: this
+    `bounds` (4, h, w) span the image bilinearly, corner on corner. Every order of the coarsest set is tried whose finest
+    phase lies between bounds 0 and 1; outside bounds 2 and 3 it costs `unexpected` of chi squared. Residuals of the finer sets decide (excess fractions: this
     covers hierarchical sets, beats, and coarse periods that wrap), and so does a Gray code where `gray` (H, W or
     (0, 0)) holds the finest phase at the middle of its code cell: `gray_half` is half the cell, `gray_soft` the
     uncertainty of its edges, both in finest phase. NaN in `gray` = no opinion.
@@ -192,7 +192,7 @@ def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, mar
     order fits worse, be it another order of the coarsest set or the other way of rounding a finer one; at most 99.
     """
     H, W = phases.shape[1], phases.shape[2]
-    h, w = low.shape
+    h, w = bounds.shape[1], bounds.shape[2]
     K = phases.shape[0]
     use_gray = gray.shape[0] == H
     for i in prange(H):
@@ -205,12 +205,14 @@ def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, mar
             x0 = min(int(x), max(w - 2, 0))
             fx = x - x0
             x1 = min(x0 + 1, w - 1)
-            lo = (1 - fy) * ((1 - fx) * low[y0, x0] + fx * low[y0, x1]) + fy * (
-                (1 - fx) * low[y1, x0] + fx * low[y1, x1]
-            )
-            hi = (1 - fy) * ((1 - fx) * high[y0, x0] + fx * high[y0, x1]) + fy * (
-                (1 - fx) * high[y1, x0] + fx * high[y1, x1]
-            )
+            w00 = (1 - fy) * (1 - fx)
+            w01 = (1 - fy) * fx
+            w10 = fy * (1 - fx)
+            w11 = fy * fx
+            lo = w00 * bounds[0, y0, x0] + w01 * bounds[0, y0, x1] + w10 * bounds[0, y1, x0] + w11 * bounds[0, y1, x1]
+            hi = w00 * bounds[1, y0, x0] + w01 * bounds[1, y0, x1] + w10 * bounds[1, y1, x0] + w11 * bounds[1, y1, x1]
+            elo = w00 * bounds[2, y0, x0] + w01 * bounds[2, y0, x1] + w10 * bounds[2, y1, x0] + w11 * bounds[2, y1, x1]
+            ehi = w00 * bounds[3, y0, x0] + w01 * bounds[3, y0, x1] + w10 * bounds[3, y1, x0] + w11 * bounds[3, y1, x1]
             best = np.nan
             best_chi2 = second_chi2 = np.inf
             best_margin2 = np.inf
@@ -231,6 +233,8 @@ def unwrap(phases, sigmas, freq, low, high, gray, gray_half, gray_soft, out, mar
                     absolute, chi2, rounding2 = _chain(phases, sigmas, freq, i, j, coarsest, order)
                     if absolute < lo or absolute > hi:
                         continue
+                    if absolute < elo or absolute > ehi:
+                        chi2 += unexpected
                     if middle == middle:
                         off = max(abs(absolute - middle) - gray_half, 0.0) / gray_soft
                         chi2 += off * off
