@@ -180,11 +180,11 @@ def gather_sparse(levels, pixel, x, y, level, gain, out):
         out[pixel[i]] += gain[i] * light_at(levels, x[i], y[i], level[i])
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def bilinear(values, x0, y0, step, points, out):
     """Looks up a raster (h, w, k) at x and y of points (n, 3) into out (n, k); edges repeat."""
     h, w, m = values.shape
-    for i in prange(points.shape[0]):
+    for i in range(points.shape[0]):
         x = min(max((points[i, 0] - x0) / step, 0.0), w - 1.001)
         y = min(max((points[i, 1] - y0) / step, 0.0), h - 1.001)
         c, r = int(x), int(y)
@@ -193,6 +193,23 @@ def bilinear(values, x0, y0, step, points, out):
             top = values[r, c, k] * (1 - f) + values[r, c + 1, k] * f
             low = values[r + 1, c, k] * (1 - f) + values[r + 1, c + 1, k] * f
             out[i, k] = top * (1 - g) + low * g
+
+
+@njit(cache=True, nogil=True)
+def spline(lattice, x, y, out):
+    """Cubic B-spline over a periodic lattice (128, 128) at columns x and rows y, all (n,)."""
+    for i in range(out.size):
+        c, r = int(math.floor(x[i])), int(math.floor(y[i]))
+        f, g = x[i] - c, y[i] - r
+        e, h = 1 - f, 1 - g
+        b0, b1, b2, b3 = e * e * e, 4 + f * f * (3 * f - 6), 4 + e * e * (3 * e - 6), f * f * f
+        d0, d1, d2, d3 = h * h * h, 4 + g * g * (3 * g - 6), 4 + h * h * (3 * h - 6), g * g * g
+        c0, c1, c2, c3 = (c - 1) & 127, c & 127, (c + 1) & 127, (c + 2) & 127
+        s = 0.0
+        for j, d in ((-1, d0), (0, d1), (1, d2), (2, d3)):
+            row = lattice[(r + j) & 127]
+            s += d * (b0 * row[c0] + b1 * row[c1] + b2 * row[c2] + b3 * row[c3])
+        out[i] = s / 36.0
 
 
 @njit(cache=True, nogil=True)
@@ -214,14 +231,14 @@ def _lobe(nx, ny, nz, lx, ly, lz, ex, ey, ez, alpha, f0):
     return a2 / (q * q) * _fresnel(f0, eh) / ((nl * (1 - k) + k) * (ne * (1 - k) + k)) / 4.0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def reflect(points, normals, shiny, dirs, lamp, axis, reach, falloff, alpha, f0, diffuse, tint, least_alpha, out):
     """Light (n,) that surfaces send along -dirs from a lamp at (3,): Lambert under a film, and the film's gloss.
 
     The lamp gives 1 at distance `reach`, falling with the square of the distance and cos(angle to its `axis`)^falloff.
     `diffuse`, `tint` (n,): the sensor's response to the body's colour, and to white.
     """
-    for i in prange(points.shape[0]):
+    for i in range(points.shape[0]):
         lx, ly, lz = lamp[0] - points[i, 0], lamp[1] - points[i, 1], lamp[2] - points[i, 2]
         r = math.sqrt(lx * lx + ly * ly + lz * lz)
         lx, ly, lz = lx / r, ly / r, lz / r
@@ -242,7 +259,7 @@ def reflect(points, normals, shiny, dirs, lamp, axis, reach, falloff, alpha, f0,
         out[i] = E * cos * value
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def expose(signal, noise, electrons, read_noise, per_electron, offset, full_well, top, out):
     """Signal (n,) to codes: photo-electrons with shot and read noise, clipped at the well, offset, rounded, clipped.
 
@@ -250,7 +267,7 @@ def expose(signal, noise, electrons, read_noise, per_electron, offset, full_well
     its variance, which the read noise covers where few electrons come.
     """
     noisy = noise.size > 0
-    for i in prange(signal.size):
+    for i in range(signal.size):
         e = max(signal[i] * electrons, 0.0)
         if noisy:
             e += math.sqrt(e + read_noise * read_noise) * noise[i]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -78,10 +79,21 @@ def thin(x: F64, y: F64, rng: np.random.Generator) -> F64:
     return np.where(r < 1, np.maximum(h * rim, 0.22), -1.0)
 
 
-SPECIMENS: dict[str, tuple[Callable[[F64, F64, np.random.Generator], F64], Palette, float, float]] = {
-    "tissue-domed": (domed, HEART, 0.10, 0.18),  # height, colours, roughness of the wet film, scattering in mm
-    "tissue-folded": (folded, GUT, 0.12, 0.22),
-    "tissue-thin": (thin, FASCIA, 0.09, 0.25),
+@dataclass(frozen=True)
+class Specimen:
+    """A kind of tissue: height above the substrate, colours, roughness of its film, scattering, the lamp it needs."""
+
+    height: Callable[[F64, F64, np.random.Generator], F64]
+    palette: Palette
+    alpha: float
+    scatter_mm: float
+    lamp: float
+
+
+SPECIMENS: dict[str, Specimen] = {
+    "tissue-domed": Specimen(domed, HEART, 0.10, 0.18, 3.0),
+    "tissue-folded": Specimen(folded, GUT, 0.12, 0.22, 2.2),
+    "tissue-thin": Specimen(thin, FASCIA, 0.09, 0.25, 1.8),
 }
 
 
@@ -90,11 +102,11 @@ def build(name: str, seed: int, base_z: float) -> tuple[Mesh, dict[str, AnyArray
 
     V is a square grid, x fastest; faces (a, b, d), (a, d, c) per cell; cells wholly below the substrate are left out.
     """
-    height, palette, alpha, scatter = SPECIMENS[name]
+    kind = SPECIMENS[name]
     rng = np.random.default_rng([seed, 3])
     shift = rng.uniform(-1.0, 1.0, 2) * (1.2, 0.8)
     x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, GRID), np.linspace(-HALF_Y, HALF_Y, GRID))
-    z = base_z + height(x - shift[0], y - shift[1], rng)
+    z = base_z + kind.height(x - shift[0], y - shift[1], rng)
     V = np.stack([x, y, z], -1).reshape(-1, 3)
     i = np.arange(GRID * GRID).reshape(GRID, GRID)
     a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
@@ -103,5 +115,5 @@ def build(name: str, seed: int, base_z: float) -> tuple[Mesh, dict[str, AnyArray
     gy, gx = np.gradient(z, y[1, 0] - y[0, 0], x[0, 1] - x[0, 0])
     N = np.stack([-gx, -gy, np.ones_like(z)], -1).reshape(-1, 3)
     N /= np.linalg.norm(N, axis=1, keepdims=True)
-    finish = Finish(organ(palette, seed), alpha, 0.035, scatter, film(seed, 0.11))
+    finish = Finish(organ(kind.palette, seed), kind.alpha, 0.035, kind.scatter_mm, film(seed, 0.11))
     return Mesh(finish, V, N, F), {"V": V, "F": F}

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from fringescope.twin import loops
 from fringescope.types import F32, F64, AnyArray
@@ -58,15 +57,11 @@ class Raster:
 
 def noise(x: AnyArray, y: AnyArray, cell_mm: float, rng: np.random.Generator) -> F64:
     """Smooth random field at (x, y): cubic spline over a random lattice of `cell_mm`; mean 0, about -1..1."""
-    lattice = rng.uniform(-1.4, 1.4, (96, 96))
-    out: F64 = map_coordinates(
-        lattice,
-        [np.asarray(y) / cell_mm + 47.3, np.asarray(x) / cell_mm + 46.1],
-        order=3,
-        mode="grid-wrap",
-        prefilter=False,
-    )
-    return out
+    lattice = rng.uniform(-1.4, 1.4, (128, 128))
+    x, y = np.broadcast_arrays(x, y)
+    out = np.empty(x.size)
+    loops.spline(lattice, np.ravel(x) / cell_mm + 46.1, np.ravel(y) / cell_mm + 47.3, out)
+    return out.reshape(x.shape)
 
 
 def fractal(x: AnyArray, y: AnyArray, cell_mm: float, octaves: int, rng: np.random.Generator, gain: float = 0.5) -> F64:
@@ -93,7 +88,7 @@ class Palette:
     dark_share: float = 0.0
 
 
-HEART = Palette((0.36, 0.075, 0.06), (0.13, 0.03, 0.03), (0.74, 0.60, 0.36), (0.20, 0.035, 0.045), -0.12, 0.25)
+HEART = Palette((0.40, 0.10, 0.08), (0.17, 0.045, 0.04), (0.74, 0.60, 0.36), (0.22, 0.045, 0.05), -0.12, 0.1)
 GUT = Palette((0.66, 0.31, 0.25), (0.36, 0.085, 0.075), (0.80, 0.62, 0.46), (0.34, 0.07, 0.08), 0.0, 0.1)
 FASCIA = Palette((0.50, 0.19, 0.15), (0.24, 0.055, 0.05), (0.82, 0.74, 0.60), (0.28, 0.06, 0.10), 0.15, 0.0)
 
@@ -115,7 +110,7 @@ def organ(palette: Palette, seed: int, half_x: float = 46.0, half_y: float = 32.
     return Raster(np.clip(c, 0.01, 0.92).astype(np.float32), (float(x[0, 0]), float(y[0, 0])), step)
 
 
-def film(seed: int, slope: float, cell_mm: float = 1.6, half: float = 90.0, step: float = 0.15) -> Raster:
+def film(seed: int, slope: float, cell_mm: float = 1.6, half: float = 48.0, step: float = 0.15) -> Raster:
     """Slopes (2) of a wavy wet film: standard deviation about `slope`."""
     rng = np.random.default_rng([seed, 11])
     x, y = np.meshgrid(np.arange(-half, half + step, step), np.arange(-half, half + step, step))
