@@ -323,7 +323,7 @@ def predict(
         flat += (2 * np.pi * (J @ untilted) / sigmas[group[-1]]) ** 2
     with np.errstate(divide="ignore"):
         depth, gain = 1 / np.sqrt(info), np.sqrt(info / flat)
-    wrong = float(-np.expm1(sum(math.log1p(-e) if e < 1 else -math.inf for e in steps)))
+    wrong = float(0.0 - np.expm1(sum(math.log1p(-e) if e < 1 else -math.inf for e in steps)))
     return Prediction(view.camera, points, tuple(sigmas.values()), tuple(steps), wrong, depth, gain)
 
 
