@@ -293,7 +293,8 @@ def predict(
 
     `noise` is the sensor's (variance a + b I in codes squared), `modulation` B and `background` A what the pixel will
     see, in codes; `point` (3,) or (n, 3) in world mm, default the volume's centre. `response_error` as `order_error`.
-    sigma_depth = sigma_phi / |2 pi g . J|. Orders settled by Gray code are not predicted.
+    sigma_depth = sigma_phi / |2 pi g . J|. Orders settled by Gray code are not predicted, nor
+    whether a coarsest period wraps (`validate` says so).
     Raises RigError if the rig lacks the camera, UsageError for a signal that is not positive, CaptureError for a view
     without fringes.
     """
