@@ -61,6 +61,8 @@ def _check(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig) -> None:
     for g, p in zip(grids, photos, strict=True):
         if not 0 <= g.view < len(rig.cameras):
             raise RigError(f"view {g.view} of camera '{g.camera}'; the rig has {len(rig.cameras)} cameras")
+        if g.camera != p.camera:
+            raise RigError(f"points of camera '{g.camera}' with the picture of '{p.camera}'; needed the same order")
         if g.sigma.shape != p.rgb.shape[:2]:
             raise RigError(f"camera '{g.camera}': points on {g.sigma.shape[1]} x {g.sigma.shape[0]} pixels, picture of "
                            f"{p.rgb.shape[1]} x {p.rgb.shape[0]}; needed the same size")
@@ -89,7 +91,7 @@ def _rise(mask: Bool, width: float) -> F32:
 
 
 def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: FuseSettings) -> _View:
-    """Weights of one view: cosine of incidence / sigma^2 along the normal, times its rise from borders and grazing."""
+    """Weights of one view: cosine of incidence / sigma^2 along the normal, times its rise from borders and jumps."""
     centre = geometry.centre(rig.cameras[grid.view].pose)
     n = normals(grid, rig, s)
     cosine, step = np.empty_like(grid.sigma), np.empty_like(grid.sigma)
@@ -102,20 +104,23 @@ def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: Fu
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     padded = cv2.copyMakeBorder(valid.astype(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
     whole = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disk)[reach:-reach, reach:-reach] > 0
+    jump = np.empty(valid.shape, np.bool_)
+    k.jumps(grid.xyz, grid.sigma, centre, s.max_slope, s.jump_sigma, jump)
+    whole &= ~jump
     rise = _rise(whole, s.blend_mm / spacing if spacing > 0 else 1.0)
     low, high = np.cos(np.radians([s.grazing_deg, s.oblique_deg]))
     front = np.clip((cosine - low) / max(high - low, 1e-6), 0.0, 1.0)
-    rise = np.maximum(rise * front * front * (3 - 2 * front), 1e-3)
+    rise = np.maximum(rise, 1e-3) * front * front * (3 - 2 * front)
     with np.errstate(invalid="ignore"):
         sigma_n = grid.sigma * np.maximum(cosine, 0.05)
         weight = np.where(valid, rise * cosine / np.maximum(sigma_n, 1e-6) ** 2, 0.0)
-    weight = np.where(valid, np.maximum(weight, 1e-6), 0.0).astype(np.float32)
     clear = _rise(~photo.saturated, s.highlight_pixels) if photo.saturated.any() else np.ones_like(rise)
     colour_weight = np.where(valid, rise * clear * cosine**2, 0.0)
     if colourless:
         colour_weight *= 1e-6
     rgb = photo.rgb * gain.astype(np.float32)
-    return _View(grid, centre, n, sigma_n.astype(np.float32), cosine, weight, rgb, colour_weight.astype(np.float32), spacing)
+    return _View(grid, centre, n, sigma_n.astype(np.float32), cosine, weight.astype(np.float32), rgb,
+                 colour_weight.astype(np.float32), spacing)
 
 
 def _views(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings) -> tuple[list[_View], F64]:
@@ -159,7 +164,7 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
             k.settle(v.grid.xyz, v.normal, v.sigma_n, v.weight, v.centre, row0, row1, shift, total, variance, facing,
                      xyz, n, sigma)
             k.blend(samples, s.gloss, row0, v.rgb, v.colour_weight, colour)
-        seen[v.weight > 0] |= np.uint8(1 << a)
+        seen[np.isfinite(v.sigma_n)] |= np.uint8(1 << a)
         fused.append(Grid(v.grid.view, v.grid.camera, xyz, sigma, v.grid.reasons))
         ns.append(n)
         pictures.append(encode_srgb(colour))
@@ -203,7 +208,7 @@ def _ownership(grids: Sequence[Grid], weights: Sequence[F32], spacings: Sequence
         total, count = np.zeros((rows, cols)), np.zeros((rows, cols), np.int32)
         k.bin_weights(ab, w, low, cell, total, count)
         smooth = cv2.blur(total, _SMOOTH) / np.maximum(cv2.blur(count.astype(np.float64), _SMOOTH), 1e-9)
-        score = np.where(count > 0, smooth, 0.0).astype(np.float32)
+        score = np.where(count > 0, smooth + 1e-12, 0.0).astype(np.float32)
         better = score > best
         best[better], owner[better] = score[better], i
     own = []

@@ -88,6 +88,29 @@ def normals(xyz, sigma, centre, radius, max_slope, jump_sigma, out):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
+def jumps(xyz, sigma, centre, max_slope, jump_sigma, out):
+    """Whether (H, W) a point's left, right, upper or lower neighbour lies across a jump, as `normals` tells them."""
+    H, W = xyz.shape[0], xyz.shape[1]
+    for i in prange(H):
+        for j in range(W):
+            out[i, j] = False
+            px, py, pz = float(xyz[i, j, 0]), float(xyz[i, j, 1]), float(xyz[i, j, 2])
+            if not math.isfinite(px):
+                continue
+            rx, ry, rz = _unit(px - centre[0], py - centre[1], pz - centre[2])
+            for side in range(4):
+                ii = i + (1 if side == 0 else -1 if side == 1 else 0)
+                jj = j + (1 if side == 2 else -1 if side == 3 else 0)
+                if ii < 0 or jj < 0 or ii >= H or jj >= W or not math.isfinite(xyz[ii, jj, 0]):
+                    continue
+                qx, qy, qz = xyz[ii, jj, 0] - px, xyz[ii, jj, 1] - py, xyz[ii, jj, 2] - pz
+                along = qx * rx + qy * ry + qz * rz
+                across = math.sqrt(max(qx * qx + qy * qy + qz * qz - along * along, 0.0))
+                if abs(along) > max_slope * across + jump_sigma * (sigma[i, j] + sigma[ii, jj]):
+                    out[i, j] = True
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
 def incidence(xyz, normal, centre, out):
     """Cosine (H, W) of the angle between the normal and the direction to `centre`; 0 where there is no point."""
     for i in prange(xyz.shape[0]):
@@ -203,7 +226,7 @@ def settle(xyz, normal, sigma_n, weight, centre, row0, row1, shift, total, varia
                     xyz_out[i, j, k] = normal_out[i, j, k] = np.nan
                 continue
             dx, dy, dz = _unit(px - centre[0], py - centre[1], pz - centre[2])
-            w = weight[i, j]
+            w = max(float(weight[i, j]), 1e-9)
             sum_w = w + total[b, j]
             along = shift[b, j] / sum_w
             xyz_out[i, j, 0], xyz_out[i, j, 1], xyz_out[i, j, 2] = px + along * dx, py + along * dy, pz + along * dz
