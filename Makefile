@@ -25,7 +25,7 @@ $(VALIDATOR): tests/glb_validator/package-lock.json tools/glb_validator.sh
 setup: $(READY) $(VALIDATOR) ## the environment alone
 
 demo: $(READY) ## scan a wet specimen on the simulated instrument and show the result
-	$(BIN)/python tools/show_demo.py build/demo
+	$(BIN)/fringescope demo --out build/demo --force
 
 test: $(READY) $(VALIDATOR) ## the tests
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile

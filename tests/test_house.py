@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import json
 import re
 import subprocess
@@ -13,8 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer.main
 
-from fringescope import geometry, store
+from fringescope import cli, geometry, store
 from fringescope.settings import describe
 from fringescope.types import FringeSet, Reason
 
@@ -260,10 +262,40 @@ def test_the_examples_on_the_formats_page_are_read(tmp_path: Path) -> None:
     assert (plan.camera, plan.sets[0]) == ("camera1", FringeSet((0.0, 0.000877), 4))
 
 
-def test_settings_page_names_every_setting() -> None:
-    text = (DOCS / "reference" / "settings.md").read_text()
-    for section, f, _ in describe():
-        assert f"`{section}.{f.name}`" in text, f"{section}.{f.name}: make reference"
+@pytest.mark.parametrize("page", ["settings", "commands"])
+def test_reference_pages_say_what_the_code_says(page: str) -> None:
+    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "tools" / "make_reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    there = (DOCS / "reference" / f"{page}.md").read_text()
+    assert there == getattr(maker, f"{page}_page")(), "run: make reference"
+    if page == "settings":
+        for section, f, _ in describe():
+            assert f"`{section}.{f.name}`" in there
+    else:
+        for verb in cli_verbs():
+            assert f"\n## {verb}\n" in there
+
+
+def cli_verbs() -> dict[str, set[str]]:
+    """Every command with the options that it takes."""
+    commands = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+    return {name: {o for p in c.params for o in (*p.opts, *p.secondary_opts)} for name, c in commands.items()}
+
+
+def test_commands_that_the_pages_tell_a_reader_to_type_exist() -> None:
+    verbs = cli_verbs()
+    told = 0
+    for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
+        for line in re.findall(r"^(?:    )?fringescope (\w+.*)$", page.read_text(), re.M):
+            words = line.split("#")[0].split()
+            assert words[0] in verbs, f"{page.name}: fringescope {words[0]}"
+            unknown = {w for w in words if w.startswith("--")} - verbs[words[0]]
+            assert not unknown, f"{page.name}: fringescope {words[0]} takes no {unknown}"
+            told += 1
+    assert told >= 6
 
 
 def test_every_docs_page_is_reached_and_every_link_leads_somewhere() -> None:
