@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,11 +24,12 @@ from fringescope.cli.common import (
     numbers,
     pixel_format,
 )
-from fringescope.errors import UsageError
+from fringescope.errors import EmptyResultError, UsageError
 
 if TYPE_CHECKING:
     from fringescope.evaluate import Evaluation
     from fringescope.settings import Settings
+    from fringescope.store import StoredScan
     from fringescope.types import U8, Cloud, Decoded, Scan, ViewInput
 
 
@@ -278,3 +280,67 @@ def _evaluation(doc: dict[str, Any]) -> list[str]:
     if doc["sigma_ratio"] is not None:
         lines.append(f"error over sigma: {doc['sigma_ratio']:.2f} (1: the uncertainty is calibrated)")
     return lines
+
+
+FORMATS = ("stl", "obj", "pcd", "e57", "3mf", "ply", "glb")
+
+
+@app.command()
+def export(
+    scan: Annotated[Path, typer.Argument(help="A scan folder.")],
+    to: Annotated[str, typer.Option(help=f"{', '.join(FORMATS)}.")],
+    out: Annotated[Path | None, typer.Option("--out", help="The file (default: SCAN's name with the format).")] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """A scan in other people's formats: the surface (stl, obj, 3mf, glb) or the points (pcd, e57, ply), in mm.
+
+    E57 is in metres, as its standard asks. obj comes with its material and pictures beside it.
+    """
+    import shutil
+
+    from fringescope import export as ex
+    from fringescope import store
+
+    kind = to.lower().lstrip(".")
+    if kind not in FORMATS:
+        raise UsageError(f"--to {to}; needed one of {', '.join(FORMATS)}")
+    stored = store.read_scan(existing(scan, "a scan folder"), grids=False)
+    target = out or Path(f"{stored.folder.resolve().name}.{kind}")
+    if kind in ("stl", "obj", "3mf", "glb") and stored.surface is None:
+        raise EmptyResultError(f"{scan}: this scan has no surface; export its points with --to ply, pcd or e57")
+    with Progress() as progress:
+        if kind == "obj":
+            written = _export_obj(stored, target, force, progress)
+        else:
+            with store.new_file(target, force=force) as tmp:
+                if kind in ("ply", "glb"):
+                    shutil.copyfile(stored.cloud if kind == "ply" else stored.folder / "surface.glb", tmp)
+                elif kind in ("pcd", "e57"):
+                    write_points = {"pcd": ex.write_pcd, "e57": ex.write_e57}[kind]
+                    progress.run(f"writing {kind}", lambda: write_points(ex.read_ply(stored.cloud), tmp))
+                else:
+                    write_mesh = {"stl": ex.write_stl, "3mf": ex.write_3mf}[kind]
+                    surface = ex.read_glb(stored.folder / "surface.glb")
+                    progress.run(f"writing {kind}", lambda: write_mesh(surface, tmp))
+            written = [target]
+    emit({"scan": str(scan), "to": kind, "files": [str(f) for f in written]}, json, [str(f) for f in written])
+
+
+def _export_obj(stored: StoredScan, target: Path, force: bool, progress: Progress) -> list[Path]:
+    """An OBJ and the files that it names, which must keep their names: made aside, then put in place."""
+    import shutil
+    import tempfile
+
+    from fringescope import export as ex
+    from fringescope import store
+
+    surface = ex.read_glb(stored.folder / "surface.glb")
+    with tempfile.TemporaryDirectory() as aside:
+        made = progress.run("writing obj", lambda: ex.write_obj(surface, Path(aside) / target.name))
+        places = [target.with_name(f.name) for f in made]
+        with ExitStack() as stack:
+            work = [stack.enter_context(store.new_file(p, force=force)) for p in places]
+            for f, w in zip(made, work, strict=True):
+                shutil.copyfile(f, w)
+    return places
