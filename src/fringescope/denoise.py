@@ -16,16 +16,29 @@ import numpy as np
 from fringescope import geometry
 from fringescope.kernels import regions as k
 from fringescope.settings import DenoiseSettings
-from fringescope.types import F64, U16, Bool, Decoded, Direction, Grid, PixelFormat, Reason, Rig, ViewVerdict, WrappedSet
+from fringescope.types import (
+    F64,
+    U16,
+    Bool,
+    Decoded,
+    Direction,
+    Grid,
+    PixelFormat,
+    Reason,
+    Rig,
+    ViewVerdict,
+    WrappedSet,
+)
 
 
 def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> U16:
     """III-D 1: dark, saturated and low-modulation pixels, as reason codes (H, W).
 
-    The modulation must exceed a floor in codes, a share of the background, a number of standard deviations of the sensor
-    noise at that background (bright and dark regions get different thresholds, V-D), and leave a phase that is not much
-    noisier than usual. Where the finest fringes have lost more contrast against the next coarser ones than is usual
-    around, the light came by way of other places (from surface to surface, below the surface): low modulation too.
+    The modulation must exceed a floor in codes, a share of the background, a number of standard deviations of the
+    sensor noise at that background (bright and dark regions get different thresholds, V-D), and leave a phase that is
+    not much noisier than usual. Where the finest fringes have lost more contrast against the next coarser ones than is
+    usual around, the light came by way of other places (from surface to surface, below the surface): low modulation
+    too.
     """
     out = decoded.reasons.copy()
     scale = pixel_format.max_value / 255.0
@@ -62,7 +75,8 @@ def _norm(g: tuple[float, float]) -> float:
 def _fine_contrast_lost(coarse: WrappedSet, fine: WrappedSet, ok: Bool, s: DenoiseSettings) -> Bool:
     """Where B(fine) / B(coarse) falls below `min_fine_modulation` of its median around (tiles of an eighth)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(ok & (coarse.saturated == 0) & (fine.saturated == 0), fine.modulation / coarse.modulation, np.nan)
+        whole = ok & (coarse.saturated == 0) & (fine.saturated == 0)
+        ratio = np.where(whole, fine.modulation / coarse.modulation, np.nan)
     if not np.isfinite(ratio).any():
         return np.zeros(ok.shape, np.bool_)
     H, W = ok.shape
@@ -170,7 +184,7 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings) -> tuple[Grid, ..
     return tuple(out)
 
 
-def verdict(grid: Grid, s: DenoiseSettings) -> ViewVerdict:
+def verdict(grid: Grid) -> ViewVerdict:
     """What a view lost and why, in figures and in words that a person can act on."""
     n = int(grid.reasons.size)
     lost = {r.name.lower(): int(((grid.reasons & r) != 0).sum()) for r in Reason if r.name}
@@ -191,8 +205,8 @@ def verdict(grid: Grid, s: DenoiseSettings) -> ViewVerdict:
 _ADVICE = (
     (Reason.DARK, 0.97, "no fringes reached this view: check lens cap, trigger and projector"),
     (Reason.SATURATED, 0.01, "halve the exposure, or add a shorter bracket"),
-    (Reason.LOW_MODULATION, 0.15, "shadow, defocus or scattered light: raise the exposure, refocus, or turn the specimen"),
-    (Reason.ORDER_UNCERTAIN, 0.02, "the coarse fringes are too noisy for the fine ones: add a set between, or more light"),
+    (Reason.LOW_MODULATION, 0.15, "shadow, defocus or scattered light: expose longer, refocus, turn it"),
+    (Reason.ORDER_UNCERTAIN, 0.02, "the coarse fringes are too noisy: add a set between, or light"),
     (Reason.REVERSED, 0.005, "mirrored fringes: dry the surface or put something dark below it"),
     (Reason.JUMP, 0.05, "edges and steep walls: turn the specimen"),
     (Reason.ISLAND, 0.02, "crumbs without neighbours: raise the exposure, or lower denoise.island_share"),

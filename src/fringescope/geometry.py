@@ -126,7 +126,7 @@ def field_of_view(rig: Rig, p_world: ArrayLike) -> Bool:
 
 
 def phase_at(projector: Projector, g: tuple[float, float], p_world: ArrayLike) -> F64:
-    """Phase (...,) in radians that the fringes of gradient `g` (cycles per plane unit) have at world points (..., 3)."""
+    """Phase (...,), radians, of fringes of gradient `g` (cycles per plane unit) at world points (..., 3)."""
     uv = project(projector, p_world)
     return np.asarray(2 * np.pi * (uv[..., 0] * g[0] + uv[..., 1] * g[1]))
 
@@ -201,7 +201,7 @@ def phase_bounds(
 
 
 def _extremes(phi: F64, ok: Bool, name: str) -> tuple[F64, F64]:
-    """Smallest and largest of `phi` (h, w, n) where `ok`, grown to the neighbours' extremes; holes filled from nearby."""
+    """Smallest and largest of `phi` (h, w, n) where `ok`, grown to the neighbours' extremes; holes filled."""
     step = np.where(ok[..., 1:] & ok[..., :-1], np.abs(np.diff(phi, axis=2)), 0.0).max(axis=2)
     low = np.where(ok, phi, np.inf).min(axis=2)
     high = np.where(ok, phi, -np.inf).max(axis=2)

@@ -71,7 +71,7 @@ def scan(
     EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
-    tell = progress or (lambda what, share: None)
+    tell = progress or _silent
     times: dict[str, float] = {}
     grids: list[Grid] = []
     photos: list[Photo] = []
@@ -89,7 +89,7 @@ def scan(
     tell("comparing the views", 0.7)
     start = perf_counter()
     grids = list(denoise.agree(grids, rig, s.denoise))
-    verdicts = tuple(denoise.verdict(g, s.denoise) for g in grids)
+    verdicts = tuple(denoise.verdict(g) for g in grids)
     if not any(v.points for v in verdicts):
         raise EmptyResultError("no point was left; " + "; ".join(w for v in verdicts for w in v.words[1:]))
     times["agree"] = perf_counter() - start
@@ -110,6 +110,10 @@ def scan(
     return Scan(
         tuple(grids), cloud, levels[0] if levels else None, verdicts, figures, levels[-1] if levels else None, every
     )
+
+
+def _silent(_what: str, _share: float) -> None:
+    """No progress is shown."""
 
 
 def _figures(decoded: Decoded, grid: Grid) -> dict[str, Any]:

@@ -15,7 +15,13 @@ from fringescope.types import F32, U16, Decoded, Grid, Reason, Rig
 
 
 def grid(
-    decoded: Decoded, reasons: U16, rig: Rig, *, volume_margin: float = 1.25, max_miss: float = 6.0, pinhole: bool = False
+    decoded: Decoded,
+    reasons: U16,
+    rig: Rig,
+    *,
+    volume_margin: float = 1.25,
+    max_miss: float = 6.0,
+    pinhole: bool = False,
 ) -> Grid:
     """Organised points of one view in world mm, with sigma along the camera's ray.
 

@@ -182,11 +182,11 @@ def _chain(phases, sigmas, freq, i, j, first, order):
 def unwrap(phases, sigmas, freq, bounds, unexpected, gray, gray_half, gray_soft, out, margin):
     """Absolute phase of the finest of K parallel sets (K, H, W), coarse to fine, by least chi squared (equation 5).
 
-    `bounds` (4, h, w) span the image bilinearly, corner on corner. Every order of the coarsest set is tried whose finest
-    phase lies between bounds 0 and 1; outside bounds 2 and 3 it costs `unexpected` of chi squared. Residuals of the finer sets decide (excess fractions: this
-    covers hierarchical sets, beats, and coarse periods that wrap), and so does a Gray code where `gray` (H, W or
-    (0, 0)) holds the finest phase at the middle of its code cell: `gray_half` is half the cell, `gray_soft` the
-    uncertainty of its edges, both in finest phase. NaN in `gray` = no opinion.
+    `bounds` (4, h, w) span the image bilinearly, corner on corner. Every order of the coarsest set is tried whose
+    finest phase lies between bounds 0 and 1; outside bounds 2 and 3 it costs `unexpected` of chi squared. Residuals of
+    the finer sets decide (excess fractions: this covers hierarchical sets, beats, and coarse periods that wrap), and so
+    does a Gray code where `gray` (H, W or (0, 0)) holds the finest phase at the middle of its code cell: `gray_half` is
+    half the cell, `gray_soft` the uncertainty of its edges, both in finest phase. NaN in `gray` = no opinion.
 
     Writes the phase (NaN if no order fits into the bounds) and `margin`: how many standard deviations the next best
     order fits worse, be it another order of the coarsest set or the other way of rounding a finer one; at most 99.

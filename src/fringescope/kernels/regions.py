@@ -29,8 +29,8 @@ def _spread(field, i, j, H, W, c):
 def gradient_signs(phase, sigma, reasons, field, reach, significance, out):
     """Sign of the phase's growth along the predicted direction (equation 17): 1 forward, -1 backward, 0 unknown.
 
-    `field` (h, w, 3) holds the unit direction (du, dv). The difference is taken over `reach` pixels on either side, or on
-    one where the other is masked; it must exceed `significance` standard deviations to count.
+    `field` (h, w, 3) holds the unit direction (du, dv). The difference is taken over `reach` pixels on either side, or
+    on one where the other is masked; it must exceed `significance` standard deviations to count.
     """
     H, W = phase.shape
     for i in prange(H):
@@ -43,8 +43,8 @@ def gradient_signs(phase, sigma, reasons, field, reach, significance, out):
             n = math.hypot(du, dv)
             if not n > 0.0:
                 continue
-            x = int(round(reach * du / n))
-            y = int(round(reach * dv / n))
+            x = round(reach * du / n)
+            y = round(reach * dv / n)
             a, b = phase[i, j], phase[i, j]
             va = vb = sigma[i, j] ** 2
             if 0 <= i + y < H and 0 <= j + x < W and reasons[i + y, j + x] == 0:
@@ -59,7 +59,7 @@ def gradient_signs(phase, sigma, reasons, field, reach, significance, out):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def majority_backward(signs, radius, share, least, out):
-    """Where the signs in the window are backward by at least `share` of at least `least` votes: a contiguous reversal."""
+    """Where at least `share` of at least `least` signs in the window are backward: a contiguous reversal."""
     H, W = signs.shape
     for i in prange(H):
         for j in range(W):
@@ -99,9 +99,10 @@ def loose_pixels(phase, sigma, reasons, field, factor, floor, noise, least, out)
             links = 0
             for y in range(max(i - 1, 0), min(i + 2, H)):
                 for x in range(max(j - 1, 0), min(j + 2, W)):
-                    if (y != i or x != j) and reasons[y, x] == 0:
-                        if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
-                            links += 1
+                    if (y == i and x == j) or reasons[y, x] != 0:
+                        continue
+                    if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+                        links += 1
             out[i, j] = links < least
 
 
@@ -125,13 +126,13 @@ def domains(phase, sigma, reasons, field, factor, floor, noise, label):
         for j in range(W):
             if reasons[i, j] != 0:
                 continue
-            if j > 0 and reasons[i, j - 1] == 0:
-                if linked(phase, sigma, field, factor, floor, noise, i, j, i, j - 1, H, W):
-                    a, b = _root(parent, i * W + j), _root(parent, i * W + j - 1)
-                    parent[max(a, b)] = min(a, b)
-            if i > 0 and reasons[i - 1, j] == 0:
-                if linked(phase, sigma, field, factor, floor, noise, i, j, i - 1, j, H, W):
-                    a, b = _root(parent, i * W + j), _root(parent, (i - 1) * W + j)
+            for back in range(2):
+                y = i - back
+                x = j - 1 + back
+                if y < 0 or x < 0 or reasons[y, x] != 0:
+                    continue
+                if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+                    a, b = _root(parent, i * W + j), _root(parent, y * W + x)
                     parent[max(a, b)] = min(a, b)
     count = 0
     for a in range(H * W):
@@ -154,9 +155,9 @@ def domains(phase, sigma, reasons, field, factor, floor, noise, label):
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _solve(M, rhs, n):
-    """Solve the symmetric positive definite n x n system in place by Cholesky; the (0, 0) of the inverse comes back too.
+    """Solve the symmetric positive definite n x n system in place by Cholesky.
 
-    Returns (ok, inverse00); the solution is in `rhs`.
+    Returns (ok, element (0, 0) of the inverse); the solution is in `rhs`.
     """
     for a in range(n):
         for b in range(a + 1):
@@ -193,9 +194,9 @@ def _solve(M, rhs, n):
 def local_surface(phase, sigma, label, radius, least, out, roughness):
     """Distance of each pixel's phase from the surface of its neighbours, in standard deviations; NaN where too few.
 
-    The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain in the window,
-    without the pixel itself, by least squares with weights 1 / sigma^2 that let go of outliers (Cauchy at 2.5 sigma).
-    `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
+    The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain in the
+    window, without the pixel itself, by least squares with weights 1 / sigma^2 that let go of outliers (Cauchy at 2.5
+    sigma). `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
     """
     H, W = phase.shape
     for i in prange(H):

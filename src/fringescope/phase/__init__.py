@@ -1,0 +1,25 @@
+"""Frames to absolute phase (II-C, equations 3 to 5): one by one into sums, then phase, noise, and the order.
+
+Captures may hold any direction, any number of steps, HDR brackets and Gray code. Bayer frames are decoded on their raw
+sites: the phase does not depend on a site's colour, so no demosaicing ever mixes pixels.
+"""
+
+from fringescope.phase.measure import measure, with_reasons
+from fringescope.phase.noise import estimate_noise
+from fringescope.phase.order import families, field_bounds, projector_coordinates, settle_order, unambiguous_span
+from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity
+
+__all__ = [
+    "FringeSums",
+    "GrayBits",
+    "Measured",
+    "estimate_noise",
+    "families",
+    "field_bounds",
+    "intensity",
+    "measure",
+    "projector_coordinates",
+    "settle_order",
+    "unambiguous_span",
+    "with_reasons",
+]

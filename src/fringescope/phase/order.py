@@ -1,0 +1,219 @@
+"""Wrapped phases to absolute phases (equation 5): the order by all sets and codes, the rig, the neighbours' vote."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fringescope import geometry
+from fringescope.errors import DecodeError
+from fringescope.kernels import fringes as k
+from fringescope.settings import PhaseSettings
+from fringescope.types import (
+    F32,
+    F64,
+    U16,
+    AnyArray,
+    Decoded,
+    Direction,
+    FringeSet,
+    GrayCode,
+    Reason,
+    Rig,
+    ViewPlan,
+    WrappedSet,
+)
+
+PARALLEL_RAD = 1e-4  #: sets whose gradients differ less than this in angle (either sign) unwrap each other
+
+
+def families(sets: Sequence[WrappedSet]) -> list[list[WrappedSet]]:
+    """Sets grouped by direction (parallel within 1e-4 rad, either sign), each group coarse to fine.
+
+    Sets that point the other way than the finest of their group are turned round (phase and gradient negated).
+    """
+    groups: list[list[WrappedSet]] = []
+    for w in sorted(sets, key=lambda w: -math.hypot(*w.g)):
+        for group in groups:
+            a, b = group[0].g, w.g
+            na, nb = math.hypot(*a), math.hypot(*b)
+            if abs(a[0] * b[1] - a[1] * b[0]) < PARALLEL_RAD * na * nb:
+                if a[0] * b[0] + a[1] * b[1] < 0:
+                    w = replace(w, g=(-b[0], -b[1]), phase=-w.phase)
+                group.append(w)
+                break
+        else:
+            groups.append([w])
+    return [g[::-1] for g in groups]
+
+
+def field_bounds(g: tuple[float, float], plane: tuple[int, int], margin: float = 0.01) -> tuple[float, float]:
+    """Smallest and largest phase of gradient `g` on the projector plane, grown by `margin` of the extent, radians."""
+    corners = [(u, v) for u in (-0.5, plane[0] - 0.5) for v in (-0.5, plane[1] - 0.5)]
+    phi = [2 * math.pi * (g[0] * u + g[1] * v) for u, v in corners]
+    grow = margin * (max(phi) - min(phi))
+    return min(phi) - grow, max(phi) + grow
+
+
+def unambiguous_span(group: Sequence[WrappedSet] | Sequence[FringeSet], tolerance_rad: float) -> float:
+    """Length along the gradient, plane units, over which the sets of one direction tell every order apart.
+
+    The smallest shift by whole coarsest periods that no finer set contradicts by more than `tolerance_rad`;
+    infinity where there is none within 1000 periods.
+    """
+    f = [math.hypot(*(w.g if isinstance(w, WrappedSet) else w.cycles_per_pixel)) for w in group]
+    for turns in range(1, 1001):
+        x = turns / f[0]
+        if all(abs(x * fi - round(x * fi)) * 2 * math.pi < tolerance_rad for fi in f[1:]):
+            return x
+    return math.inf
+
+
+def settle_order(
+    decoded: Decoded, plan: ViewPlan, s: PhaseSettings, rig: Rig | None = None, volume_margin: float = 1.25
+) -> Decoded:
+    """Wrapped phases to absolute phases, one `Direction` per fringe direction (equation 5, [33]).
+
+    Without a rig the projector's field bounds the orders. With a rig each camera ray bounds them by its way through the
+    measuring volume: this settles coarsest periods that wrap inside the field. Among the orders that are possible the
+    one with the least chi squared over all sets and Gray codes wins; neighbours then vote on single wrong orders.
+    Raises DecodeError if a direction has neither sets nor code that span the field (without a rig).
+    """
+    groups = families(decoded.sets)
+    out: list[Direction] = []
+    reasons = decoded.reasons.copy()
+    used: set[int] = set()
+    for group in groups:
+        g = group[-1].g
+        gray, half, soft = _gray_phase(decoded.gray, g, used)
+        if rig is None:
+            lo, hi = field_bounds(g, plan.projector_size)
+            bounds = np.broadcast_to(np.array([lo, hi, lo, hi])[:, None, None], (4, 2, 2)).copy()
+            span = unambiguous_span(group, 4 * s.systematic_rad)
+            field = (hi - lo) / (2 * math.pi * math.hypot(*g))
+            if gray is None and span < 0.7 * field:
+                raise DecodeError(
+                    f"view '{plan.camera}': the sets along ({g[0]:.4g}, {g[1]:.4g}) repeat after {span:.0f} projector "
+                    f"units, the field is {field:.0f}; add a coarser period or a Gray code, or give a rig"
+                )
+        else:
+            bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
+        direction, bad = _unwrap(group, bounds, gray, half, soft, s)
+        out.append(direction)
+        reasons |= bad
+    for i, code in enumerate(decoded.gray):
+        if i not in used:
+            direction, bad = _from_gray(code)
+            out.append(direction)
+            reasons |= bad
+    return replace(decoded, directions=tuple(out), reasons=reasons)
+
+
+def _unwrap(
+    group: Sequence[WrappedSet], bounds: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
+) -> tuple[Direction, U16]:
+    phases = np.stack([w.phase for w in group])
+    sigmas = np.stack([np.hypot(w.sigma, np.float32(s.systematic_rad)) for w in group])
+    freq = np.array([math.hypot(*w.g) for w in group])
+    shape = phases.shape[1:]
+    absolute, margin = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    none = np.zeros((0, 0), np.float32)
+    unexpected = s.unexpected_sigma**2
+    k.unwrap(phases, sigmas, freq, bounds, unexpected, none if gray is None else gray, half, soft, absolute, margin)
+    uncertain = ~(margin >= s.order_min_margin)
+    if s.order_votes > 1:
+        trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)
+        absolute, changed = _elect(np.where(trusted, absolute, np.float32(np.nan)), absolute, s)
+        uncertain = np.where(changed == -128, True, uncertain & (changed == 0) & (margin < s.order_min_margin))
+    reasons = np.where(uncertain | ~np.isfinite(absolute), np.uint16(Reason.ORDER_UNCERTAIN), np.uint16(0))
+    return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons.astype(np.uint16)
+
+
+def _elect(voters: F32, absolute: F32, s: PhaseSettings) -> tuple[F32, AnyArray]:
+    """Repair single wrong orders by the vote of the neighbours, three rounds."""
+    slope = _usual_slope(voters)
+    radius = s.order_votes // 2
+    total = np.zeros(absolute.shape, np.int16)
+    current = voters
+    changed = np.zeros(absolute.shape, np.int8)
+    for _ in range(3):
+        nxt = np.empty_like(current)
+        k.order_votes(current, radius, max(3, (2 * radius + 1) ** 2 // 4), s.order_majority, slope, nxt, changed)
+        total += np.where(changed == -128, 0, changed)
+        current = nxt
+        if not ((changed != 0) & (changed != -128)).any():
+            break
+    repaired = np.where(np.isfinite(current), current, absolute)
+    return repaired.astype(np.float32), np.where(changed == -128, -128, np.clip(total, -127, 127))
+
+
+def _usual_slope(phase: F32) -> float:
+    """Largest believable phase slope, radians per pixel: four times the usual one, at most 1.2."""
+    usual = 0.0
+    for axis in (0, 1):
+        d = np.diff(phase, axis=axis)
+        d = d[np.isfinite(d)]
+        if d.size:
+            usual = max(usual, float(np.median(np.abs(d))))
+    return min(max(4 * usual, 0.2), 1.2)
+
+
+def _gray_phase(
+    codes: Sequence[GrayCode], g: tuple[float, float], used: set[int]
+) -> tuple[F32 | None, float, float]:
+    """The finest phase at the middle of each pixel's Gray cell, half a cell and the softness of its edge, radians."""
+    best: tuple[F32 | None, float, float] = (None, 0.0, 0.0)
+    cell = math.inf
+    for i, code in enumerate(codes):
+        along, across = (g[0], g[1]) if code.axis == "u" else (g[1], g[0])
+        if abs(across) > PARALLEL_RAD * abs(along):
+            continue
+        used.add(i)
+        if code.cell < cell:
+            cell = code.cell
+            u = -0.5 + (code.value + 0.5) * code.cell
+            phase = np.where(code.value >= 0, 2 * math.pi * along * u, np.nan).astype(np.float32)
+            half = math.pi * abs(along) * code.cell
+            best = (phase, half, 0.1 * half + 0.3)
+    return best
+
+
+def _from_gray(code: GrayCode) -> tuple[Direction, U16]:
+    """A Gray code alone is a direction too: one cycle per cell, uniform within the cell."""
+    g = (1.0 / code.cell, 0.0) if code.axis == "u" else (0.0, 1.0 / code.cell)
+    u = -0.5 + (code.value + 0.5) * code.cell
+    phase = np.where(code.value >= 0, 2 * math.pi * u / code.cell, np.nan).astype(np.float32)
+    sigma = np.full(phase.shape, 2 * math.pi / math.sqrt(12), np.float32)
+    reasons = np.where(code.value >= 0, np.uint16(0), np.uint16(Reason.ORDER_UNCERTAIN))
+    return Direction(g, phase, sigma, np.full(phase.shape, 99, np.float32)), reasons.astype(np.uint16)
+
+
+def projector_coordinates(decoded: Decoded) -> tuple[F32, F32]:
+    """Projector-plane coordinates u, v (H, W) of every pixel, without a rig; NaN where the directions do not tell.
+
+    Two or more directions give both (least squares weighted by sigma); one direction along u or v gives that one.
+    """
+    shape = decoded.shape
+    u, v = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
+    d = decoded.directions
+    if len(d) >= 2:
+        w = [1 / np.maximum(x.sigma.astype(np.float64), 1e-6) ** 2 for x in d]
+        y = [x.phase / (2 * math.pi) for x in d]
+        a = np.add.reduce([wi * x.g[0] ** 2 for wi, x in zip(w, d, strict=True)])
+        b = np.add.reduce([wi * x.g[0] * x.g[1] for wi, x in zip(w, d, strict=True)])
+        c = np.add.reduce([wi * x.g[1] ** 2 for wi, x in zip(w, d, strict=True)])
+        p = np.add.reduce([wi * x.g[0] * yi for wi, x, yi in zip(w, d, y, strict=True)])
+        q = np.add.reduce([wi * x.g[1] * yi for wi, x, yi in zip(w, d, y, strict=True)])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            det = a * c - b * b
+            u, v = ((c * p - b * q) / det).astype(np.float32), ((a * q - b * p) / det).astype(np.float32)
+    else:
+        g = d[0].g
+        if abs(g[1]) < PARALLEL_RAD * abs(g[0]):
+            u = (d[0].phase / (2 * math.pi * g[0])).astype(np.float32)
+        elif abs(g[0]) < PARALLEL_RAD * abs(g[1]):
+            v = (d[0].phase / (2 * math.pi * g[1])).astype(np.float32)
+    return u, v
