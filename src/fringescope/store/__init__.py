@@ -13,7 +13,7 @@ from fringescope.store.capture import (
     write_capture,
 )
 from fringescope.store.files import new_file, new_folder, write_json
-from fringescope.store.images import write_png, write_tiff
+from fringescope.store.images import Images, write_png, write_tiff
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
 from fringescope.store.scan import (
     StoredScan,
@@ -30,6 +30,7 @@ __all__ = [
     "Capture",
     "CaptureView",
     "Frames",
+    "Images",
     "StoredScan",
     "check_rig",
     "hash_capture",
