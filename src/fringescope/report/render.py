@@ -26,8 +26,8 @@ class Viewpoint:
     the longer side; `zoom` above 1 comes nearer than what shows everything.
     """
 
-    azimuth_deg: float = -90.0
-    elevation_deg: float = 50.0
+    azimuth_deg: float = -78.0
+    elevation_deg: float = 60.0
     fov_deg: float = 18.0
     zoom: float = 1.0
 
@@ -63,7 +63,7 @@ class _Canvas:
 
 def render_surface(
     surface: Surface,
-    size: tuple[int, int] = (1600, 1200),
+    size: tuple[int, int] = (1600, 1000),
     viewpoint: Viewpoint | None = None,
     coloured: bool = True,
     background: tuple[int, int, int] | None = DARK,
@@ -95,7 +95,7 @@ def render_surface(
 
 def render_cloud(
     cloud: Cloud,
-    size: tuple[int, int] = (1600, 1200),
+    size: tuple[int, int] = (1600, 1000),
     viewpoint: Viewpoint | None = None,
     coloured: bool = True,
     background: tuple[int, int, int] | None = DARK,

@@ -10,7 +10,7 @@ from fringescope.report.figures import Panel, contact_sheet, fringe_picture, pha
 from fringescope.report.render import Viewpoint, render_surface
 from fringescope.types import U8, AnyArray, Decoded, Grid, PixelFormat, Surface
 
-VIEWPOINTS = (Viewpoint(-75, 58), Viewpoint(-90, 89.9), Viewpoint(-160, 35), Viewpoint(20, 35))  #: around a specimen
+VIEWPOINTS = (Viewpoint(), Viewpoint(-90, 89.9), Viewpoint(-160, 35), Viewpoint(20, 35))  #: around a specimen
 
 
 def story(
