@@ -179,7 +179,7 @@ def test_mirrors_give_all_their_light_and_nothing_more(layout):
     m = optics.MARGIN
     u = (np.array([400, 1001]) if layout is Layout.DIAMOND else np.array([200, 500])) + m
     area = 2.0 if layout is Layout.DIAMOND else 1.0  # units squared per mirror
-    assert light.sum() == pytest.approx(2 * area, rel=1e-5)
+    assert light.sum() == pytest.approx(2 * area, rel=1e-3)  # the dark mirrors' 1e-9 adds up
     assert light[300 + m, u[0]] == pytest.approx(1)
     assert light[301 + m, u[1]] == pytest.approx(1)
     stack = optics.LightStack(optics.blur_levels(1.5, 6.0), 1.0)
@@ -349,32 +349,40 @@ def test_rays_and_footprint_blur_agree_on_a_smooth_surface():
     inst = presets.instrument("single", SCALE)
     p = inst.rig.projector
     image = fringe(p, (0.7 / 48, 0.7 / 48), 1, 4)
-    smooth = render.Renderer(plane_at(3.0), inst, rays=4).signal("camera1", image)
+    renderer = render.Renderer(plane_at(3.0), inst, rays=4)
+    smooth, t = renderer.signal("camera1", image), renderer.truth("camera1")
     before = render.MOST_BEND
     try:
-        render.MOST_BEND = -1.0  # every pixel counts as rough: nine rays each
-        traced = render.Renderer(plane_at(3.0), inst, rays=9).signal("camera1", image)
+        render.MOST_BEND = -1.0  # every pixel counts as rough: 16 rays each
+        traced = render.Renderer(plane_at(3.0), inst, rays=16).signal("camera1", image)
     finally:
         render.MOST_BEND = before
-    inner = traced[20:-20, 20:-20] > 0.02
-    d = (smooth - traced)[20:-20, 20:-20][inner]
-    assert np.abs(d).max() < 0.02 * traced.max()
+    inner = (t.uv > 30).all(-1) & (t.uv < np.array(p.plane_size) - 30).all(-1)
+    d = (smooth - traced)[inner]
+    assert inner.sum() > 5000
+    assert np.abs(d).max() < 0.03 * traced.max()
     assert abs(d.mean()) < 1e-3
 
 
 def test_wet_walls_mirror_reversed_fringes():
-    wet = dataclasses.replace(WHITE, f0=0.04, alpha=0.1)
-    ball = shapes.Sphere(wet, (0.0, 0.0, 0.0), 18.0)
-    floor = scene.tilted_plane(np.eye(3), (0, 0, -4.0), WHITE)
-    s = scene.Scene("wet", 0, (floor, ball))
-    inst = presets.instrument("paper", SCALE)
-    t = render.Renderer(s, inst).truth("camera1")
-    assert (t.mirrored[t.shape == 0] == 0).all()  # the floor is matt
-    some = (t.shape == 1) & (t.mirrored > 0.02)
-    assert some.sum() > 30
-    assert t.xyz[some][:, 2].max() < 9.0  # on the steep lower part only
-    dry = render.Renderer(s, inst, mirrors=False).truth("camera1")
-    assert (dry.mirrored == 0).all()
+    black = textures.Finish(textures.uniform((0.0, 0.0, 0.0)), alpha=0.05, f0=0.04)
+    ball = shapes.Sphere(black, (0.0, 0.0, 2.0), 18.0)
+    s = scene.Scene("wet", 0, (scene.tilted_plane(np.eye(3), (0, 0, -4.0), WHITE), ball))
+    inst = presets.instrument("single", SCALE).ideal()
+    p, g = inst.rig.projector, (0.0, 1 / 90)
+    r = render.Renderer(s, inst)
+    phase, _, modulation = decode(np.array([r.signal("camera1", fringe(p, g, n, 4)) for n in range(4)], float))
+    t = r.truth("camera1")
+    core = cv2.erode((t.shape == 1).astype(np.uint8), np.ones((5, 5))) > 0
+    some = core & (t.mirrored > 0.99) & (modulation > 1e-3)
+    down = some[1:] & some[:-1]
+    mirrored = wrapped(np.diff(phase, axis=0))[down]  # what the wall shows
+    own = (2 * np.pi * np.diff(t.uv @ np.array(g), axis=0))[down]  # what lights the wall itself
+    assert down.sum() > 100
+    assert (np.sign(mirrored) != np.sign(own)).mean() > 0.9
+    away = cv2.dilate((t.shape == 1).astype(np.uint8), np.ones((5, 5))) == 0
+    assert (t.mirrored[away] == 0).all()  # the floor is matt
+    assert (render.Renderer(s, inst, mirrors=False).truth("camera1").mirrored == 0).all()
 
 
 def test_gloss_saturates_where_the_lamp_is_mirrored():
@@ -506,7 +514,7 @@ def test_opencv_finds_the_board_where_the_truth_says(kind):
     if kind == "checkerboard":
         ok, found = cv2.findChessboardCornersSB(image, (b.columns - 1, b.rows - 1))
         assert ok
-        found = found[:, 0]
+        found = found.reshape(-1, 2)
         if np.linalg.norm(found[0] - true[0]) > np.linalg.norm(found[-1] - true[0]):
             found = found[::-1]
     else:

@@ -199,7 +199,7 @@ def bilinear(values, x0, y0, step, points, out):
 def spline(lattice, x, y, out):
     """Cubic B-spline over a periodic lattice (128, 128) at columns x and rows y, all (n,)."""
     for i in range(out.size):
-        c, r = int(math.floor(x[i])), int(math.floor(y[i]))
+        c, r = math.floor(x[i]), math.floor(y[i])
         f, g = x[i] - c, y[i] - r
         e, h = 1 - f, 1 - g
         b0, b1, b2, b3 = e * e * e, 4 + f * f * (3 * f - 6), 4 + e * e * (3 * e - 6), f * f * f

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
-from fringescope.errors import RigError, UsageError
+from fringescope.errors import UsageError
 from fringescope.twin import loops, optics
 from fringescope.twin.presets import Instrument
 from fringescope.twin.scene import Scene
@@ -98,14 +99,15 @@ class Renderer:
     """Renders one scene through one instrument; keeps each camera's geometry once it has been needed.
 
     Where a pixel's surroundings are smooth, one ray serves and its footprint is blur; at edges of shape, shadow or
-    colour `rays` (1, 4 or 9) are traced. `mirrors`: whether wet surfaces mirror what lies around them.
+    colour `rays` (1, 4 or 16; None: what suits the scene) are traced. `mirrors`: whether wet surfaces mirror
+    what lies around them.
     """
 
     def __init__(self, scene: Scene, instrument: Instrument, rays: int | None = None, mirrors: bool = True) -> None:
-        if rays not in (None, 1, 4, 9):
-            raise UsageError(f"rays {rays}; needed 1, 4 or 9 per pixel")
+        if rays not in (None, 1, 4, 16):
+            raise UsageError(f"rays {rays}; needed 1, 4 or 16 per pixel")
         self.scene, self.instrument = scene, instrument
-        self._rays, self._mirrors = rays or 4, mirrors
+        self._rays, self._mirrors = rays or scene.rays, mirrors
         self._views: dict[str, _View] = {}
         p = instrument.rig.projector
         self._aspect = float(p.lens.K[0, 0] / p.lens.K[1, 1])
@@ -212,10 +214,10 @@ class Renderer:
             edges = np.flatnonzero(rough)
             found = [f._replace(**_pick(f, ~rough[f.pixel])) for f in found]
             gain[edges] = steady[edges] = ring[edges] = 0.0
-            offsets, weights = _quadrature(self._rays)
+            offsets, weight = _quadrature(self._rays), 1.0 / self._rays
             for part in np.array_split(edges, len(edges) // TILE + 1):
                 base = _pixels(cam, part)
-                for o, weight in zip(offsets, weights, strict=True):
+                for o in offsets:
                     origin, d = optics.look(cam.lens, cam.pose, base + spread[part, None] * o)
                     rays = self._shade(cam, origin, d, part)
                     steady[part] += weight * rays.room
@@ -414,13 +416,14 @@ def _footprint(u: F32, v: F32, gain: F32, shape: AnyArray, aspect: float) -> tup
     return np.sqrt(0.5 * np.where(rough, 0, length)), rough.ravel()
 
 
-def _quadrature(rays: int) -> tuple[F64, F64]:
-    """Offsets (rays, 2) in standard deviations and weights (rays,), of unit second moment along both axes."""
+def _quadrature(rays: int) -> F64:
+    """Offsets (rays, 2) of equal weight whose mean is 0 and whose covariance is 1; no two alike along either axis."""
     if rays == 1:
-        return np.zeros((1, 2)), np.ones(1)
+        return np.zeros((1, 2))
     if rays == 4:
-        return np.array([[-1.0, -1], [1, -1], [-1, 1], [1, 1]]), np.full(4, 0.25)
-    if rays == 9:
-        x, w = np.array([-math.sqrt(3), 0, math.sqrt(3)]), np.array([1, 4, 1]) / 6
-        return np.array([[a, b] for b in x for a in x]), np.array([a * b for b in w for a in w])
-    raise RigError(f"{rays} rays per pixel; needed 1, 4 or 9")
+        return np.array([[1.0, 3], [3, -1], [-1, -3], [-3, 1]]) / math.sqrt(5)
+    i = np.arange(16)
+    reverse = (i & 1) * 8 + (i & 2) * 2 + (i & 4) // 2 + (i & 8) // 8  # Hammersley's points, made normal
+    x = ndtri((np.stack([i, reverse], 1) + 0.5) / 16)
+    values, vectors = np.linalg.eigh(np.cov(x.T, bias=True))
+    return np.asarray(x @ vectors / np.sqrt(values) @ vectors.T)

@@ -11,7 +11,7 @@ import numpy as np
 from fringescope.errors import UsageError
 from fringescope.twin import boards, specimens
 from fringescope.twin.shapes import Boxes, Plane, Shape, Sphere
-from fringescope.twin.textures import Finish, film, uniform
+from fringescope.twin.textures import Finish, Lazy, film, uniform
 from fringescope.types import F64, Pose
 
 CERAMIC = Finish(uniform((0.78, 0.78, 0.76)), scatter_mm=0.03)
@@ -32,6 +32,7 @@ class Scene:
     shapes: tuple[Shape, ...]
     lamp: float = 1.0
     ring: float = 1.0
+    rays: int = 4  #: rays per pixel at edges that suit it
     truth: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -125,13 +126,14 @@ def _board(seed: int, lift: float, pose: int, kind: str) -> Scene:
     sheet = Plane(Finish(board.albedo), T, x, y)
     floor = tilted_plane(np.eye(3), (0.0, 0.0, -45.0 + lift), Finish(uniform((0.05, 0.05, 0.05))))
     truth = {"poses.json": [{"R": T.R.tolist(), "t": T.t.tolist()}], "board.json": board.spec}
-    return Scene("board", seed, (floor, sheet), lamp=0.95, truth=truth)
+    return Scene("board", seed, (floor, sheet), lamp=0.95, rays=16, truth=truth)
 
 
 def _tissue(name: str, seed: int, lift: float) -> Scene:
     base = SUBSTRATE_Z + lift
     mesh, arrays = specimens.build(name, seed, base)
-    tray = Finish(uniform((0.16, 0.18, 0.20)), alpha=0.12, f0=0.035, bumps=film(seed + 1, 0.05, 4.0, 90.0, 0.6))
+    wet = Lazy(lambda: film(seed + 1, 0.05, 4.0, 90.0, 0.6))
+    tray = Finish(uniform((0.16, 0.18, 0.20)), alpha=0.12, f0=0.035, bumps=wet)
     floor = tilted_plane(np.eye(3), (0.0, 0.0, base), tray)
     truth = {"tissue.json": {"mesh": "tissue_mesh.npz", "base_z": base}, "tissue_mesh.npz": arrays}
     return Scene(name, seed, (floor, mesh), lamp=specimens.SPECIMENS[name].lamp, ring=1.5, truth=truth)

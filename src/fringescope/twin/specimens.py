@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fringescope.twin.shapes import Mesh
-from fringescope.twin.textures import FASCIA, GUT, HEART, Finish, Palette, film, fractal, noise, organ
+from fringescope.twin.textures import FASCIA, GUT, HEART, Finish, Lazy, Palette, film, fractal, noise, organ
 from fringescope.types import F64, AnyArray
 
 GRID = 720  #: vertices along each side of a specimen's grid
@@ -115,5 +115,6 @@ def build(name: str, seed: int, base_z: float) -> tuple[Mesh, dict[str, AnyArray
     gy, gx = np.gradient(z, y[1, 0] - y[0, 0], x[0, 1] - x[0, 0])
     N = np.stack([-gx, -gy, np.ones_like(z)], -1).reshape(-1, 3)
     N /= np.linalg.norm(N, axis=1, keepdims=True)
-    finish = Finish(organ(kind.palette, seed), kind.alpha, 0.035, kind.scatter_mm, film(seed, 0.11))
+    body, wet = Lazy(lambda: organ(kind.palette, seed)), Lazy(lambda: film(seed, 0.11))
+    finish = Finish(body, kind.alpha, 0.035, kind.scatter_mm, wet)
     return Mesh(finish, V, N, F), {"V": V, "F": F}

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -53,6 +54,22 @@ class Raster:
         out = np.empty((len(points), self.values.shape[2]))
         loops.bilinear(self.values, *self.origin, self.step, np.ascontiguousarray(points), out)
         return out
+
+
+class Lazy:
+    """A map that is made when it is first looked at."""
+
+    def __init__(self, make: Callable[[], Raster]) -> None:
+        self._make = make
+
+    @cached_property
+    def raster(self) -> Raster:
+        """The map."""
+        return self._make()
+
+    def __call__(self, points: F64) -> F64:
+        """As `Raster`."""
+        return self.raster(points)
 
 
 def noise(x: AnyArray, y: AnyArray, cell_mm: float, rng: np.random.Generator) -> F64:
