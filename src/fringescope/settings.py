@@ -93,7 +93,7 @@ class FuseSettings(_Section):
     """Three grids to one coloured cloud (III-C end, Fig. 12)."""
 
     normal_radius: int = knob(2, "pixels", "half side of the window whose points give a normal", "", 1, 15)
-    max_slope: float = knob(4.0, "", "neighbours whose range differs by more than this share of their sideways distance lie across a jump", "", 0)
+    max_slope: float = knob(3.0, "", "neighbours whose range differs by more than this share of their sideways distance lie across a jump", "", 0)
     jump_sigma: float = knob(5.0, "sigma", "noise that is no jump", "", 0)
     agree_sigma: float = knob(5.0, "sigma", "views whose surfaces differ by more than this, plus agree_mm, do not see the same place", "III-C", 0)
     agree_mm: float = knob(0.05, "mm", "what the calibration may make views differ by", "III-C", 0)
@@ -117,7 +117,7 @@ class MeshSettings(_Section):
     preview_triangles: int = knob(50_000, "", "triangles of the small level that shows first", "", 100)
     max_points: int = knob(400_000, "", "points that are triangulated at most; denser clouds are strided", "", 1000)
     max_edge: float = knob(3.5, "spacings", "longer edges bridge a hole or a shadow and go", "", 1.5)
-    jump_slope: float = knob(0.6, "", "an edge that leaves both its ends' tangent planes by more than this share of its length, plus jump_sigma, is a jump", "", 0)
+    jump_slope: float = knob(0.35, "", "an edge that leaves both its ends' tangent planes by more than this share of its length, plus jump_sigma, is a jump", "", 0)
     jump_sigma: float = knob(5.0, "sigma", "noise that is no jump", "", 0)
     max_error_mm: float = knob(0.03, "mm", "how far the simplified surface may leave the points; more triangles stay where it would", "", 0)
     min_area_mm2: float = knob(0.5, "mm^2", "smaller pieces of surface are crumbs and go", "", 0)

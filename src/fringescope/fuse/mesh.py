@@ -192,7 +192,6 @@ def surface(fused: Fused, rig: Rig, s: MeshSettings | None = None) -> tuple[Surf
                                "look at the reasons per view, or raise mesh.max_edge")
     levels = []
     for triangles, error in ((s.triangles, s.max_error_mm), (s.preview_triangles, 4 * s.max_error_mm)):
-        faces = _outward(_simplify(faces, p.xyz, triangles, error), p.xyz, rig)
-        faces = _one_fan(_two_sided(faces, p.xyz), len(p.xyz))
+        faces = _one_fan(_two_sided(_simplify(faces, p.xyz, triangles, error), p.xyz), len(p.xyz))
         levels.append(_assemble(faces, p, fused, rig))
     return tuple(levels)

@@ -1,0 +1,173 @@
+"""The surface judged by exact scenes: on the points, over no jump or shadow, a manifold, with the picture in its place."""
+
+import numpy as np
+import pytest
+
+from fringescope import fuse, geometry
+from fringescope.errors import EmptyResultError
+from fringescope.settings import MeshSettings
+from fringescope.types import Grid
+from tests import fuse_scenes as scenes
+from tests.reference import surface as reference
+
+
+def faces_of(surface):
+    return np.concatenate([p.vertex_index[p.faces] for p in surface.parts]).astype(int)
+
+
+def build(hit, cameras=3, sigma=0.004, s=None, seed=0, **size):
+    r, rng = scenes.rig(cameras, **size), np.random.default_rng(seed)
+    grids = [scenes.grid(r, i, hit, sigma, rng) for i in range(cameras)]
+    fused = fuse.merge(grids, [scenes.photo(g) for g in grids], r)
+    return r, grids, fused, fuse.cloud(fused), fuse.surface(fused, r, s)
+
+
+@pytest.fixture(scope="module")
+def on_ball():
+    return build(scenes.ball(), s=MeshSettings(triangles=12_000, preview_triangles=4_000))
+
+
+def test_vertices_are_points_of_the_cloud(on_ball):
+    _, _, _, c, levels = on_ball
+    points = {p.tobytes() for p in c.xyz}
+    for level in levels:
+        assert all(v.tobytes() in points for v in level.vertices)
+        assert len(np.unique(level.vertices, axis=0)) == len(level.vertices)
+
+
+def test_levels_of_detail_have_the_triangles_asked_for_and_stay_near_the_points(on_ball):
+    r, _, _, c, levels = on_ball
+    assert 9_000 < levels[0].n_faces <= 12_000
+    assert 3_000 < levels[1].n_faces <= 4_000
+    hit = scenes.ball()
+    for level, most in zip(levels, (0.03, 0.06), strict=True):
+        corner = level.vertices[faces_of(level)].astype(float)
+        for w in ((1 / 3, 1 / 3, 1 / 3), (0.5, 0.5, 0), (0, 0.5, 0.5), (0.5, 0, 0.5)):
+            e = np.abs(hit.error(np.tensordot(w, corner, (0, 1))))
+            assert np.percentile(e, 95) < most
+            assert e.max() < 0.5
+
+
+def test_every_edge_and_vertex_is_that_of_a_manifold_facing_outwards(on_ball):
+    r, _, _, _, levels = on_ball
+    for level in levels:
+        f = faces_of(level)
+        directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+        assert len(np.unique(directed, axis=0)) == len(directed), "each edge once in each direction at most"
+        for v in np.random.default_rng(0).integers(0, len(level.vertices), 60):
+            assert len(reference.fans(f[(f == v).any(1)], v)) == 1
+        corner = level.vertices[f].astype(float)
+        n = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        to_light = geometry.centre(r.projector.pose) - corner[:, 0]
+        assert ((n * to_light).sum(1) > 0).mean() > 0.998, "a simplification folds hardly any"
+        np.testing.assert_allclose(np.linalg.norm(level.normals, axis=1), 1, atol=1e-4)
+
+
+def test_nothing_bridges_ball_and_floor(on_ball):
+    _, _, _, _, levels = on_ball
+    for level in levels:
+        corner = level.vertices[faces_of(level)].astype(float)
+        ball = np.abs(np.linalg.norm(corner - [0, 0, 4], axis=2) - 6) < 0.3
+        floor = np.abs(corner[..., 2] + 2) < 0.05
+        both = ball.any(1) & floor.any(1) & (corner[..., 2].max(1) > -1.5)
+        assert not both.any()
+
+
+def test_nothing_crosses_a_step_or_its_shadow():
+    _, _, _, c, levels = build(scenes.step(1.0))
+    corner = levels[0].vertices[faces_of(levels[0])]
+    assert ((c.xyz[:, 2] > 0.9).sum() > 1000) and ((c.xyz[:, 2] < 0.1).sum() > 1000)
+    up, down = (corner[..., 2] > 0.9).any(1), (corner[..., 2] < 0.1).any(1)
+    assert not (up & down).any()
+
+
+def test_a_plane_is_whole():
+    r, grids, _, c, levels = build(scenes.plane((0, 0, 1), 0.0), sigma=0.002)
+    corner = levels[0].vertices[faces_of(levels[0])].astype(float)
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
+    cells = np.unique(np.floor(c.xyz[:, :2] / 0.6), axis=0)
+    assert area == pytest.approx(0.36 * len(cells), rel=0.05)
+
+
+def test_a_hole_stays_open_and_crumbs_go():
+    r, rng = scenes.rig(1), np.random.default_rng(1)
+
+    def keep(p, u, v):
+        far = np.hypot(u - 80, v - 60)
+        return (far > 12) | (far < 1.5)
+
+    g = scenes.grid(r, 0, scenes.plane((0, 0, 1), 0.0), 0.002, rng, keep)
+    fused = fuse.merge([g], [scenes.photo(g)], r)
+    level = fuse.surface(fused, r)[0]
+    corner = level.vertices[faces_of(level)]
+    middle = g.xyz[60, 80]
+    assert np.linalg.norm(corner - middle, axis=2).min() > 10 * 0.25
+
+
+def test_the_picture_lies_where_it_belongs():
+    """Colour looked up through uv equals the paint at the vertex: half a pixel off would show."""
+    _, _, fused, _, levels = build(scenes.plane())
+    looked_at = 0
+    for part in levels[0].parts:
+        h, w = part.texture.shape[:2]
+        x, y = part.uv[:, 0] * w - 0.5, part.uv[:, 1] * h - 0.5
+        assert (x >= 0).all()
+        assert (y <= h - 1).all()
+        i, j = np.clip(np.floor(y).astype(int), 0, h - 2), np.clip(np.floor(x).astype(int), 0, w - 2)
+        fy, fx = (y - i)[:, None], (x - j)[:, None]
+        t = fuse.decode_srgb(part.texture).astype(float)
+        colour = (1 - fy) * ((1 - fx) * t[i, j] + fx * t[i, j + 1]) + fy * ((1 - fx) * t[i + 1, j] + fx * t[i + 1, j + 1])
+        want = scenes.paint(levels[0].vertices[part.vertex_index].astype(float))
+        inner = (np.abs(levels[0].vertices[part.vertex_index][:, :2]) < [12, 8]).all(1)
+        if inner.sum() < 300:
+            continue
+        looked_at += 1
+        error = colour[inner] - want[inner]
+        slope = 0.25 * 0.012  # change of green over one pixel of 0.25 mm
+        assert abs(np.median(error[:, 1])) < 0.1 * slope + 0.5 / 255
+        assert np.abs(error).max() < 0.02
+    assert looked_at >= 1
+
+
+def test_texture_keeps_the_cameras_sampling():
+    _, _, fused, _, levels = build(scenes.plane())
+    for part in levels[0].parts:
+        H, W = fused.grids[part.view].sigma.shape
+        x = part.uv[:, 0] * part.texture.shape[1]
+        assert part.texture.shape[0] <= H
+        assert part.texture.shape[1] <= W
+        spread = levels[0].vertices[part.vertex_index]
+        assert np.ptp(x) >= 0.8 * np.ptp(spread[:, 0]) / fused.spacing_mm[part.view] * 0.8
+
+
+def test_denser_clouds_are_strided():
+    _, _, _, _, levels = build(scenes.plane(), s=MeshSettings(max_points=1500))
+    assert len(levels[0].vertices) <= 1600
+    corner = levels[0].vertices[faces_of(levels[0])]
+    assert 900 < len(corner)
+
+
+def test_too_few_points_for_a_triangle():
+    r = scenes.rig(1)
+    g = scenes.grid(r, 0, scenes.plane(), keep=lambda p, u, v: (v == 60) & (u < 82) & (u > 78))
+    fused = fuse.merge([g], [scenes.photo(g)], r)
+    with pytest.raises(EmptyResultError, match="no surface"):
+        fuse.surface(fused, r)
+    apart = scenes.grid(r, 0, scenes.plane(), keep=lambda p, u, v: (u % 10 == 0) & (v % 10 == 0))
+    with pytest.raises(EmptyResultError, match="no surface"):
+        fuse.surface(fuse.merge([apart], [scenes.photo(apart)], r), r)
+
+
+def test_noise_larger_than_the_sampling_does_not_tear_the_surface():
+    _, _, _, c, levels = build(scenes.plane((0, 0, 1), 0.0), cameras=1, sigma=0.2)
+    assert levels[0].n_faces > 1.8 * len(c)
+    assert isinstance(levels[0].vertices, np.ndarray)
+
+
+def test_normals_are_those_of_the_grid():
+    r, g = scenes.rig(1), None
+    g = scenes.grid(r, 0, scenes.plane())
+    n = fuse.normals(g, r)
+    want = np.array([0.05, 0.1, 1]) / np.linalg.norm([0.05, 0.1, 1])
+    np.testing.assert_allclose(n[g.valid], np.broadcast_to(want, n[g.valid].shape), atol=5e-3)
+    assert isinstance(g, Grid)
