@@ -55,7 +55,8 @@ def run(args: Sequence[str]) -> int:
     args = [a for a in args if a != "--debug"]
     try:
         result: Any = typer.main.get_command(app).main(args=list(args), prog_name="fringescope", standalone_mode=False)
-        return result if isinstance(result, int) else 0
+        status = result if isinstance(result, int) else 0
+        return _fail("interrupted; nothing was written", 130, debug) if status == 130 else status
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted; nothing was written", 130, debug)
     except UsageError as e:
@@ -63,8 +64,9 @@ def run(args: Sequence[str]) -> int:
     except FringescopeError as e:
         return _fail(e, 1, debug)
     except _ClickError as e:
-        message = e.format_message() if hasattr(e, "format_message") else e
+        message = str(e.format_message() if hasattr(e, "format_message") else e)
         if type(e).__name__ == "NoArgsIsHelpError":
+            print(message or typer.main.get_command(app).get_help(typer.Context(typer.main.get_command(app))))
             return 2
         return _fail(f"{message} (see fringescope --help)", 2, debug)
     except BrokenPipeError:

@@ -173,6 +173,9 @@ def decode(
             d = pipeline.decode_view(v, s)
             nowhere = np.full(d.shape, np.nan, np.float32)
             decoded.append((d, *((nowhere, nowhere) if extra else phase.projector_coordinates(d))))
+        if not any((d.reasons == 0).any() for d, _, _ in decoded):
+            lost = ", ".join(f"{d.camera}: {n} {r}" for d, _, _ in decoded for r, n in store.lost(d.reasons).items())
+            raise EmptyResultError(f"{capture}: no pixel can be decoded ({lost}): give more light")
         digest = digest or store.hash_capture(c)
         doc = progress.run(
             "writing",
