@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 VALIDATOR := tests/glb_validator/node_modules/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench docs verify reference lock clean
+.PHONY: help setup demo test check bench docs verify reference pictures lock clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
@@ -47,6 +47,9 @@ verify: $(READY) $(VALIDATOR) ## the long statistical tests; goes on where it st
 
 reference: $(READY) ## write docs/reference/ anew from the code
 	$(BIN)/python tools/make_reference.py
+
+pictures: $(READY) ## draw the pictures of README and docs anew from the digital twin
+	$(BIN)/python tools/make_pictures.py
 
 lock: ## resolve constraints/ anew (needs uv from the package registry)
 	tools/lock.sh "$(PYTHON)"
