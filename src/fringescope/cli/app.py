@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from fringescope import __version__
+from fringescope.cli.common import INTERRUPTED
 from fringescope.errors import FringescopeError, UsageError
 
 app = typer.Typer(
@@ -89,10 +90,12 @@ def _fail(message: object, status: int, debug: bool) -> int:
 
 
 def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
+    INTERRUPTED.set()  # a compiler's callback may swallow what is raised here: the next sign of progress raises again
     raise KeyboardInterrupt
 
 
 def main() -> NoReturn:
     """The console script."""
-    signal.signal(signal.SIGTERM, _interrupt)  # so that temporary folders go, as with Ctrl-C
+    for number in (signal.SIGINT, signal.SIGTERM):  # either way temporary folders go
+        signal.signal(number, _interrupt)
     sys.exit(run(sys.argv[1:]))

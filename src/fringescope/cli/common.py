@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from fringescope.types import PixelFormat
 
 T = TypeVar("T")
+
+INTERRUPTED = threading.Event()  #: set once somebody asked to stop
 
 Out = Annotated[Path, typer.Option("--out", help="Where the result goes: a new or empty folder.", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="Replace a result of the same kind that is there already.")]
@@ -132,7 +135,8 @@ class Progress:
             self._bars.stop()
 
     def __call__(self, stage: str, done: float, total: float) -> None:
-        """Stage `stage` has done `done` of `total`."""
+        """Stage `stage` has done `done` of `total`. Raises KeyboardInterrupt once somebody asked to stop."""
+        self._check()
         now = time.perf_counter()
         begun = self._begun.setdefault(stage, now)
         ended = done >= total
@@ -145,8 +149,13 @@ class Progress:
                 self._tasks[stage] = self._bars.add_task(stage, total=total)
             self._bars.update(self._tasks[stage], completed=done, total=total)
 
+    def _check(self) -> None:
+        if INTERRUPTED.is_set():
+            raise KeyboardInterrupt
+
     def share(self, what: str, share: float) -> None:
         """`what` begins when `share` (0 to 1) of the whole is done: the form in which `pipeline` tells."""
+        self._check()
         now = time.perf_counter()
         if self._bars is not None:
             if "" not in self._tasks:
