@@ -1,6 +1,22 @@
 """The command line: each verb a few lines. `main` is the console script, `run` the same for tests."""
 
-from fringescope.cli import capturing, demo, scanning
 from fringescope.cli.app import app, main, run
+from fringescope.cli.capturing import devices, import_, patterns, settings_, simulate
+from fringescope.cli.scanning import decode, evaluate, export, reconstruct
+from fringescope.cli.showing import demo
 
-__all__ = ["app", "capturing", "demo", "main", "run", "scanning"]
+__all__ = [
+    "app",
+    "decode",
+    "demo",
+    "devices",
+    "evaluate",
+    "export",
+    "import_",
+    "main",
+    "patterns",
+    "reconstruct",
+    "run",
+    "settings_",
+    "simulate",
+]
