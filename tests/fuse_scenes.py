@@ -19,9 +19,13 @@ def look_at(eye, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)):
 
 def rig(cameras=3, width=160, height=120, tilt_deg=30.0):
     """A projector 300 mm above the origin and cameras around it, 40 x 30 mm in view, all lenses distorted."""
-    projector = Projector(200, 160, Layout.GRID,
-                          Lens(200, 160, np.array([[1450.0, 0, 99], [0, 1450.0, 81], [0, 0, 1]]), np.array([-0.05, 0.1, 1e-4, 2e-4, 0])),
-                          look_at([0, 0, 300.0]))
+    projector = Projector(
+        200,
+        160,
+        Layout.GRID,
+        Lens(200, 160, np.array([[1450.0, 0, 99], [0, 1450.0, 81], [0, 0, 1]]), np.array([-0.05, 0.1, 1e-4, 2e-4, 0])),
+        look_at([0, 0, 300.0]),
+    )
     made = []
     t = np.radians(tilt_deg)
     for i in range(cameras):
@@ -29,7 +33,9 @@ def rig(cameras=3, width=160, height=120, tilt_deg=30.0):
         eye = 320 * np.array([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)])
         f = 8.0 * width
         K = np.array([[f, 0, width / 2 - 0.3], [0, f * 1.001, height / 2 + 0.4], [0, 0, 1]])
-        made.append(Camera(f"camera{i + 1}", Lens(width, height, K, np.array([-0.2, 1.5, 2e-4, -1e-4, 0])), look_at(eye)))
+        made.append(
+            Camera(f"camera{i + 1}", Lens(width, height, K, np.array([-0.2, 1.5, 2e-4, -1e-4, 0])), look_at(eye))
+        )
     return Rig(projector, tuple(made))
 
 
@@ -95,13 +101,21 @@ def grid(r, view, hit, sigma=0.005, rng=None, keep=None):
     lit = hit(light, ray / far[..., None]) > far - 1e-3
     uv = geometry.project(r.projector, p)
     with np.errstate(invalid="ignore"):
-        ok = lit & np.isfinite(t) & (uv > 0).all(-1) & (uv[..., 0] < r.projector.width - 1) & (uv[..., 1] < r.projector.height - 1)
+        ok = (
+            lit
+            & np.isfinite(t)
+            & (uv > 0).all(-1)
+            & (uv[..., 0] < r.projector.width - 1)
+            & (uv[..., 1] < r.projector.height - 1)
+        )
     if keep is not None:
         ok &= keep(p, u, v)
     if rng is not None:
         p = p + (sigma * rng.standard_normal(t.shape))[..., None] * d
     xyz = np.where(ok[..., None], p, np.nan).astype(np.float32)
-    return Grid(view, cam.name, xyz, np.where(ok, sigma, np.nan).astype(np.float32), np.where(ok, 0, 1).astype(np.uint16))
+    return Grid(
+        view, cam.name, xyz, np.where(ok, sigma, np.nan).astype(np.float32), np.where(ok, 0, 1).astype(np.uint16)
+    )
 
 
 def paint(p):

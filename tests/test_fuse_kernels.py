@@ -52,7 +52,9 @@ def test_doubles_equal_brute_force(seed):
     lookup = np.full((10, 10), -1, np.int64)
     lookup.ravel()[unique] = np.arange(len(unique))
     out = np.zeros(60, bool)
-    kernels.doubles(ab[order], view[order], np.full(60, reach), np.append(start, 60), unique // 10, unique % 10, lookup, out)
+    kernels.doubles(
+        ab[order], view[order], np.full(60, reach), np.append(start, 60), unique // 10, unique % 10, lookup, out
+    )
     want = reference.doubles(ab, view, reach, order)
     np.testing.assert_array_equal(out, want[order])
     kept = order[~out]
@@ -96,9 +98,33 @@ def test_gather_finds_the_shift_between_two_exact_views():
     colour = scenes.photo(b).rgb
     ones = np.where(b.valid, np.float32(1), np.float32(0))
     sigma_a, sigma_b = np.full((H, W), 0.005, np.float32), np.full((H, W), 0.005, np.float32)
-    kernels.gather(a.xyz, n, sigma_a, centre, 0, H, r.cameras[1].pose.R, r.cameras[1].pose.t,
-                   geometry.lens_vector(r.cameras[1].lens), b.xyz, n.copy(), sigma_b, ones, ones, colour, ones, 5.0, 0.05,
-                   np.uint8(2), shift, total, variance, facing, seen, sample)
+    kernels.gather(
+        a.xyz,
+        n,
+        sigma_a,
+        centre,
+        0,
+        H,
+        r.cameras[1].pose.R,
+        r.cameras[1].pose.t,
+        geometry.lens_vector(r.cameras[1].lens),
+        b.xyz,
+        n.copy(),
+        sigma_b,
+        ones,
+        ones,
+        colour,
+        ones,
+        5.0,
+        0.05,
+        np.uint8(2),
+        shift,
+        total,
+        variance,
+        facing,
+        seen,
+        sample,
+    )
     hit = seen == 2
     assert hit.sum() > 1000
     rays = a.xyz[hit] - centre
@@ -124,7 +150,9 @@ def test_triangles_equal_their_twin_and_fans_are_counted_right():
     area = np.empty(300)
     mesh_kernels.areas(faces, xyz, area)
     e = xyz[faces].astype(float)
-    np.testing.assert_allclose(area, np.linalg.norm(np.cross(e[:, 1] - e[:, 0], e[:, 2] - e[:, 0]), axis=1) / 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        area, np.linalg.norm(np.cross(e[:, 1] - e[:, 0], e[:, 2] - e[:, 0]), axis=1) / 2, rtol=1e-5
+    )
 
 
 def test_bow_tie_loses_its_smaller_fan():

@@ -61,7 +61,7 @@ def glb_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, quality
     cameras saw them; `lit` leaves the light to the viewer. Raises OutputError if a picture cannot be encoded.
     """
     b = _Buffer()
-    primitives, materials, textures, images = [], [], [], []
+    primitives, materials, textures, images = (list[dict[str, Any]]() for _ in range(4))
     for i, part in enumerate(surface.parts):
         if not len(part.faces):
             continue

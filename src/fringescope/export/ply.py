@@ -72,7 +72,7 @@ def read_ply(path: str | Path) -> Cloud:
         kind = np.dtype(fields)
         body = f.read(kind.itemsize * count)
     if len(body) < kind.itemsize * count:
-        raise FormatError(f"{path}: truncated, {len(body)} bytes of points; its header promises {kind.itemsize * count}")
+        raise FormatError(f"{path}: truncated, {len(body)} bytes of points, needed {kind.itemsize * count}")
     v = np.frombuffer(body, kind)
     names = kind.names or ()
 

@@ -1,4 +1,4 @@
-"""The fused points to a textured triangle mesh with levels of detail: vertices are points of the cloud, none is moved."""
+"""The fused points to a textured triangle mesh with levels of detail; its vertices are points of the cloud."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _outward(faces: NDArray[np.int64], xyz: F32, rig: Rig) -> NDArray[np.int64]:
 
 
 def _simplify(faces: NDArray[np.int64], xyz: F32, triangles: int, error_mm: float) -> NDArray[np.int64]:
-    """At most `triangles` triangles over a subset of the same vertices, unless `error_mm` asks for more; borders stay."""
+    """At most `triangles` triangles over a subset of the same vertices, unless `error_mm` asks for more."""
     if len(faces) <= triangles:
         return faces
     used, local = np.unique(faces, return_inverse=True)
@@ -148,7 +148,7 @@ def _part_views(faces: NDArray[np.int64], p: _Points, views: int) -> U8:
     for v in range(views):
         score[:, v] = (p.owner[faces] == v).sum(axis=1)
         score[:, v] += 10 * ((p.seen[faces] >> v) & 1).all(axis=1)
-    return score.argmax(axis=1).astype(np.uint8)
+    return np.asarray(score.argmax(axis=1), dtype=np.uint8)
 
 
 def _part(view: int, faces: NDArray[np.int64], vertex: NDArray[np.int64], p: _Points, fused: Fused,

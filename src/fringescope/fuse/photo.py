@@ -26,7 +26,7 @@ def _linear(raw: AnyArray, pixel_format: PixelFormat, camera: str) -> F32:
                            "a pixel, as the sensor gave it")
     elif pixel_format.is_bayer:
         if min(raw.shape) < 4:
-            raise CaptureError(f"camera '{camera}': a picture of {raw.shape[1]} x {raw.shape[0]}; needed at least 4 x 4")
+            raise CaptureError(f"camera '{camera}': {raw.shape[1]} x {raw.shape[0]} pixels; needed at least 4 x 4")
         rgb = cv2.cvtColor(np.ascontiguousarray(raw), _RGGB)
     else:
         rgb = np.repeat(raw[:, :, None], 3, axis=2)
@@ -36,17 +36,18 @@ def _linear(raw: AnyArray, pixel_format: PixelFormat, camera: str) -> F32:
 def photo(raw: AnyArray, pixel_format: PixelFormat, camera: str, s: FuseSettings | None = None) -> Photo:
     """A raw ring-light picture as linear light.
 
-    `raw` is (H, W) for mono and Bayer formats, (H, W, 3) for RGB8, uint8 or uint16 codes, right-aligned; codes are taken
-    as proportional to light, as they are in the fringes. Bayer pictures are demosaiced along edges, without a shift.
-    White balance: `white_red` and `white_blue` of the settings (`white_gains` finds them). A pixel is saturated if any
+    `raw` is (H, W) for mono and Bayer formats, (H, W, 3) for RGB8, uint8 or uint16 codes, right-aligned; codes
+    are taken as proportional to light, as they are in the fringes. Bayer pictures are demosaiced along edges, without a
+    shift. White balance: `white_red` and `white_blue` of the settings (`white_gains` finds them). A pixel is saturated if any
     raw sample that went into it is. Mono gives grey. Raises CaptureError if the shape does not fit the format.
     """
     s = s or FuseSettings()
     rgb = _linear(raw, pixel_format, camera)
     full = np.asarray(raw >= pixel_format.max_value)
-    full = full.any(axis=2) if full.ndim == 3 else full
+    if full.ndim == 3:
+        full = np.asarray(full.any(axis=2))
     if pixel_format.is_bayer:
-        full = cv2.dilate(full.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        full = np.asarray(cv2.dilate(full.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     if pixel_format.is_colour:
         rgb *= np.array([s.white_red, 1.0, s.white_blue], np.float32)
     return Photo(camera, rgb, full)
@@ -91,7 +92,7 @@ def encode_srgb(linear: AnyArray) -> U8:
     table = np.linspace(0.0, 1.0, 4097)
     table = np.where(table <= 0.0031308, 12.92 * table, 1.055 * table ** (1 / 2.4) - 0.055)
     codes = (table * 255.0 + 0.5).astype(np.uint8)
-    return codes[(np.clip(np.nan_to_num(linear), 0.0, 1.0) * 4096.0 + 0.5).astype(np.uint16)]
+    return np.asarray(codes[(np.clip(np.nan_to_num(linear), 0.0, 1.0) * 4096.0 + 0.5).astype(np.uint16)])
 
 
 def decode_srgb(codes: U8) -> F32:
@@ -104,8 +105,9 @@ def decode_srgb(codes: U8) -> F32:
 def view_gains(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings) -> F64:
     """Factors (V, 3) that make the pictures agree where views overlap; their geometric mean is 1 per channel.
 
-    For each pair of views the mean of the middle half of the log ratios of what both see unsaturated (up to 50,000 places where their surfaces
-    agree); then least squares over the pairs. Views without overlap keep 1, as do a grey picture's ratios of channels.
+    For each pair of views the mean of the middle half of the log ratios of what both see unsaturated (up to 50,000
+    places where their surfaces agree); then least squares over the pairs. Views without overlap keep 1, as do a grey
+    picture's ratios of channels.
     """
     V = len(grids)
     rows: list[F64] = []

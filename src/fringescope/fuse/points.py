@@ -1,4 +1,4 @@
-"""Organised grids to one cloud: what the views agree on, who owns a place, and what colour it has (III-C end, Fig. 12)."""
+"""Organised grids to one cloud: what the views agree on, who owns a place, what colour it has (III-C end, Fig. 12)."""
 
 from __future__ import annotations
 
@@ -178,8 +178,8 @@ def _ownership(grids: Sequence[Grid], weights: Sequence[F32], spacings: Sequence
                s: FuseSettings) -> list[Bool]:
     """Which points make the one layer.
 
-    Every point is lit by the projector, so the surface is single-valued over the projector's field: cells of that field,
-    about two samples wide, each belong to the view with the largest smoothed weight among those with a point there.
+    Every point is lit by the projector, so the surface is single-valued over the projector's field: cells of it, about
+    two samples wide, each belong to the view with the largest smoothed weight among those with a point there.
     Points of different views nearer than the separation across a border of cells are doubles; one of them goes.
     """
     valid = [np.isfinite(g.xyz[..., 0]) for g in grids]
@@ -200,8 +200,9 @@ def _ownership(grids: Sequence[Grid], weights: Sequence[F32], spacings: Sequence
     separation = max(s.separation_mm, 0.5 * spacing) / depth
     cell = max(2.0 * spacing / depth, 1.01 * separation)
     with np.errstate(invalid="ignore"):
-        low = np.min([np.nanmin(ab.reshape(-1, 2), axis=0) for ab, ok in zip(coordinates, valid, strict=True) if ok.any()], 0)
-        high = np.max([np.nanmax(ab.reshape(-1, 2), axis=0) for ab, ok in zip(coordinates, valid, strict=True) if ok.any()], 0)
+        filled = [ab.reshape(-1, 2) for ab, ok in zip(coordinates, valid, strict=True) if ok.any()]
+        low = np.min([np.nanmin(ab, axis=0) for ab in filled], axis=0)
+        high = np.max([np.nanmax(ab, axis=0) for ab in filled], axis=0)
     cols, rows = (np.floor((high - low) / cell).astype(int) + 1).tolist()
     best, owner = np.zeros((rows, cols), np.float32), np.full((rows, cols), -1, np.int16)
     for i, (ab, w) in enumerate(zip(coordinates, weights, strict=True)):
