@@ -38,8 +38,8 @@ def photo(raw: AnyArray, pixel_format: PixelFormat, camera: str, s: FuseSettings
 
     `raw` is (H, W) for mono and Bayer formats, (H, W, 3) for RGB8, uint8 or uint16 codes, right-aligned; codes
     are taken as proportional to light, as they are in the fringes. Bayer pictures are demosaiced along edges, without a
-    shift. White balance: `white_red` and `white_blue` of the settings (`white_gains` finds them). A pixel is saturated if any
-    raw sample that went into it is. Mono gives grey. Raises CaptureError if the shape does not fit the format.
+    shift. White balance: `white_red` and `white_blue` of the settings (`white_gains` finds them). A pixel is saturated
+    if any raw sample that went into it is. Mono gives grey. Raises CaptureError if the shape does not fit the format.
     """
     s = s or FuseSettings()
     rgb = _linear(raw, pixel_format, camera)
