@@ -248,8 +248,8 @@ class _Proof:
             return
         worst = int(energy.argmax())
         limit = self._s.max_wrong_frame * modulation
-        alone = spec.steps > 4 and energy[worst] > 3.0 * np.median(energy)
-        if (alone and energy[worst] > limit**2) or (spec.steps == 4 and energy[worst] > (3.5 * limit) ** 2):
+        alone = spec.steps > 4 and energy[worst] > 2.0 * np.median(energy)
+        if (alone and energy[worst] > limit**2) or (spec.steps == 4 and energy[worst] > (2.0 * limit) ** 2):
             names = label(FrameKey(index, Role.STEP, worst)) if alone else f"one of set {index + 1}"
             raise self._fail(f"{names} shows another pattern than the plan's: repeated or swapped")
 
