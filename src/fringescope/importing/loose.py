@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from fringescope.errors import CaptureError, UsageError
-from fringescope.store.images import Images, check_frame, stack_axes
+from fringescope.store.images import Images, check_frame, quiet, stack_axes
 from fringescope.types import (
     AnyArray,
     FrameKey,
@@ -183,7 +183,8 @@ class LooseFrames:
         if Path(name).suffix.lower() in READ_BY_OPENCV:
             try:
                 data = np.fromfile(self.folder / name, np.uint8)
-                a = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+                with quiet():
+                    a = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
             except (OSError, cv2.error) as e:
                 raise CaptureError(f"{self.folder / name}: cannot read: {str(e).splitlines()[0]}") from e
             if a is None:

@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import re
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +46,43 @@ def split_page(name: str) -> tuple[str, int | None]:
     """ "file.tif#3" to ("file.tif", 3); any other name to (name, None)."""
     m = _PAGE.match(name)
     return (m[1], int(m[2])) if m else (name, None)
+
+
+class _Complaints(logging.Handler):
+    """What tifffile only logs about a damaged file becomes an error, and none of it reaches stderr."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.thread = threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Remembers the first complaint of this thread by raising it."""
+        if threading.get_ident() == self.thread:
+            raise ValueError(record.getMessage().partition("> ")[2] or record.getMessage())
+
+
+@contextmanager
+def _strict() -> Iterator[None]:
+    logger = logging.getLogger("tifffile")
+    handler, passes = _Complaints(), logger.propagate
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = passes
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """OpenCV keeps what it thinks of a damaged file to itself: the one line about it is ours."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 class Images:
@@ -131,14 +172,16 @@ class Images:
         path = self.folder / file
         if self._stack is None or self._stack[0] != file:
             try:
-                self._stack = (file, tifffile.TiffFile(io.BytesIO(self._bytes(file) if data is None else data)))
+                with _strict():
+                    self._stack = (file, tifffile.TiffFile(io.BytesIO(self._bytes(file) if data is None else data)))
             except CaptureError:
                 raise
             except Exception as e:
                 raise CaptureError(f"{path}: truncated or unreadable TIFF ({_first_line(e)})") from e
         tif = self._stack[1]
         try:
-            n = len(tif.pages)
+            with _strict():
+                n = len(tif.pages)
             if n == 0:
                 raise CaptureError(f"{path}: a TIFF without pages; needed a frame")
             if page is None and n > 1:
@@ -159,7 +202,7 @@ def stack_axes(path: Path) -> tuple[dict[str, int], int]:
     Raises CaptureError if it is no TIFF.
     """
     try:
-        with tifffile.TiffFile(path) as tif:
+        with _strict(), tifffile.TiffFile(path) as tif:
             series = tif.series[0]
             axes = dict(zip(series.axes, series.shape, strict=True))
             return {a: n for a, n in axes.items() if a not in "YXS"}, len(tif.pages)
@@ -187,7 +230,10 @@ def _not_an_image(data: bytes) -> str:
 def _tiff_header(page: tifffile.TiffPage, path: Path, kinds: str = "u") -> Header:
     if page.dtype is None or page.dtype.kind not in kinds:
         raise CaptureError(f"{path}: samples of type {page.dtype}; needed unsigned 8 or 16 bits")
-    return Header(page.imagewidth, page.imagelength, page.samplesperpixel, int(page.bitspersample))
+    told = (page.imagewidth, page.imagelength, page.samplesperpixel, page.bitspersample)
+    if not all(isinstance(n, int) for n in told):  # a damaged tag
+        raise CaptureError(f"{path}: truncated or unreadable TIFF (size {told})")
+    return Header(*told)
 
 
 def _lzw(page: tifffile.TiffPage) -> AnyArray:
@@ -195,8 +241,9 @@ def _lzw(page: tifffile.TiffPage) -> AnyArray:
     handle = page.parent.filehandle
     handle.seek(0)
     data, which = np.frombuffer(handle.read(), np.uint8), (page.index, page.index + 1)
-    ok, pages = cv2.imdecodemulti(data, cv2.IMREAD_UNCHANGED, range=which)
-    if not ok:
+    with quiet():
+        ok, pages = cv2.imdecodemulti(data, cv2.IMREAD_UNCHANGED, range=which)
+    if not ok or not pages:
         raise ValueError("LZW data cannot be decoded")
     a: AnyArray = pages[0]
     return a if a.ndim == 2 else np.ascontiguousarray(a[..., ::-1])
@@ -204,12 +251,14 @@ def _lzw(page: tifffile.TiffPage) -> AnyArray:
 
 def _tiff_array(page: tifffile.TiffPage, path: Path, kinds: str = "u") -> AnyArray:
     head = _tiff_header(page, path, kinds)
-    how = tifffile.COMPRESSION(page.compression)
     try:
-        a: AnyArray = np.asarray(_lzw(page) if how is tifffile.COMPRESSION.LZW else page.asarray())
+        with _strict():
+            lzw = page.compression == tifffile.COMPRESSION.LZW
+            a: AnyArray = np.asarray(_lzw(page) if lzw else page.asarray())
     except Exception as e:
         if "imagecodecs" in str(e):
-            raise CaptureError(f"{path}: TIFF compressed as {how.name}; save it uncompressed or as deflate") from e
+            how = tifffile.COMPRESSION(page.compression).name
+            raise CaptureError(f"{path}: TIFF compressed as {how}; save it uncompressed or as deflate") from e
         raise CaptureError(f"{path}: truncated or unreadable TIFF ({_first_line(e)})") from e
     if a.ndim == 3 and a.shape[0] == head.channels and a.shape[-1] != head.channels:
         a = np.moveaxis(a, 0, -1)
@@ -237,7 +286,8 @@ def decode_png(data: bytes, path: Path) -> AnyArray:
     if bits < 8:
         raise CaptureError(f"{path}: {bits}-bit PNG; needed 8 or 16 bits")
     try:
-        a = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        with quiet():
+            a = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as e:
         raise CaptureError(f"{path}: unreadable PNG ({_first_line(e)})") from e
     if a is None or a.shape[:2] != (h, w):
@@ -266,6 +316,8 @@ def check_header(head: Header, fmt: PixelFormat, size: tuple[int, int] | None, n
 
 def check_frame(a: AnyArray, fmt: PixelFormat, size: tuple[int, int] | None, name: str) -> AnyArray:
     """Samples as stored to a frame of `fmt`; three identical channels become one. Raises CaptureError naming `name`."""
+    if a.ndim not in (2, 3):
+        raise CaptureError(f"{name}: an array of shape {a.shape}; needed height x width")
     channels = 1 if a.ndim == 2 else a.shape[2]
     check_header(Header(a.shape[1], a.shape[0], channels, 8 * a.dtype.itemsize), fmt, size, name)
     if fmt is not PixelFormat.RGB8 and channels == 3:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
@@ -13,6 +14,8 @@ from fringescope.store import files
 from fringescope.types import F64, Camera, Layout, Lens, Pose, Projector, Rig, Volume
 
 FORMAT, VERSION = "fringescope-rig", 1
+LARGEST = 1e7  #: no number of a rig is larger: mm, pixels, distortion
+SHORTEST = 1e-2  #: pixels, focal length
 
 
 class _Model(BaseModel):
@@ -106,7 +109,10 @@ def read_rig(path: Path | str) -> Rig:
 
 
 def _lens(d: _Device, width: int, height: int) -> Lens:
-    return Lens(width, height, _np(d.K), _np(d.distortion))
+    lens = Lens(width, height, _np(d.K), _np(d.distortion))
+    if min(lens.K[0, 0], lens.K[1, 1]) < SHORTEST:
+        raise RigError(f"K: focal lengths {lens.K[0, 0]:g}, {lens.K[1, 1]:g} pixels; needed at least {SHORTEST:g}")
+    return lens
 
 
 def _pose(d: _Device) -> Pose:
@@ -114,7 +120,13 @@ def _pose(d: _Device) -> Pose:
 
 
 def _np(a: Any) -> F64:
-    return cast(F64, a)  # types.py makes and checks the array
+    """Refuses numbers with which nothing can be computed; types.py makes and checks the array."""
+    for x in a:
+        if isinstance(x, list):
+            _np(x)
+        elif math.isfinite(x) and (abs(x) > LARGEST or 0 < abs(x) < 1e-100):
+            raise RigError(f"the number {x!r:.30}; needed 0 or a magnitude of at most {LARGEST:g}")
+    return cast(F64, a)
 
 
 def _extra(m: _Rig) -> dict[str, Any]:
