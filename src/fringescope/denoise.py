@@ -61,7 +61,8 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
         out[clipped] &= ~np.uint16(Reason.LOW_MODULATION | Reason.ORDER_UNCERTAIN)
         ok = out == 0
         if ok.any():
-            out[ok & (d.sigma > s.max_sigma_factor * np.median(d.sigma[ok]))] |= np.uint16(Reason.LOW_MODULATION)
+            limit = max(s.max_sigma_rad, s.max_sigma_factor * float(np.median(d.sigma[ok])))
+            out[ok & (d.sigma > limit)] |= np.uint16(Reason.LOW_MODULATION)
         if len(family) > 1:
             out[ok & _fine_contrast_lost(family[-2], family[-1], ok, s)] |= np.uint16(Reason.LOW_MODULATION)
     out[dark] &= ~np.uint16(Reason.ORDER_UNCERTAIN | Reason.INCONSISTENT)

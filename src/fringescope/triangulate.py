@@ -62,10 +62,23 @@ def grid(
 
 
 def _outside(rig: Rig, name: str, xyz: F32, reasons: U16, margin: float) -> None:
-    """Mark points outside the measuring space, row block by row block."""
-    camera = rig.camera(name)
+    """Mark points outside the measuring space and on the rim of the projector's field, row block by row block.
+
+    A camera pixel that straddles the rim saw half a fringe: half its footprint, in projector units, is the margin.
+    """
+    camera, projector = rig.camera(name), rig.projector
+    some = xyz[::7, ::7][np.isfinite(xyz[::7, ::7, 2])]
+    if not len(some):
+        some = np.asarray(rig.volume.center if rig.volume else geometry.working_point(rig))[None]
+    z_camera = float(np.median(geometry.transform(camera.pose, some)[:, 2]))
+    z_projector = float(np.median(geometry.transform(projector.pose, some)[:, 2]))
+    footprint = z_camera / camera.lens.K[0, 0]
+    rim = np.maximum(0.5 * footprint * np.array([projector.lens.K[0, 0], projector.lens.K[1, 1]]) / z_projector, 0.5)
+    high = np.array(projector.plane_size) - 1 - rim
     for row in range(0, xyz.shape[0], 256):
         block, r = xyz[row : row + 256], reasons[row : row + 256]
         with np.errstate(invalid="ignore"):
-            out = (r == 0) & ~geometry.measuring_space(rig, camera, block, margin)
+            uv = geometry.project(projector, block)
+            ok = ((uv >= rim) & (uv <= high)).all(axis=-1) & geometry.measuring_space(rig, camera, block, margin)
+            out = (r == 0) & ~ok
         r[out] |= np.uint16(Reason.OUT_OF_VOLUME)

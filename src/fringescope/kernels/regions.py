@@ -77,33 +77,42 @@ def majority_backward(signs, radius, share, least, out):
 
 @njit(cache=True, inline="always", error_model="numpy")
 def linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
-    """Whether two neighbouring pixels continue one surface: their phases differ by less than T1.
+    """Whether two pixels in one row or column or diagonal continue one surface: their phases differ by less than T1.
 
     T1 = `factor` times the growth that a surface facing both devices has at this pixel (channel 2 of `field`, radians
-    per pixel), at least `floor`, plus `noise` standard deviations.
+    per pixel), at least `floor`, times the distance, plus `noise` standard deviations.
     """
-    limit = max(factor * _spread(field, i, j, H, W, 2), floor)
+    limit = max(factor * _spread(field, i, j, H, W, 2), floor) * max(abs(i - y), abs(j - x))
     limit += noise * math.sqrt(sigma[i, j] ** 2 + sigma[y, x] ** 2)
     return abs(phase[i, j] - phase[y, x]) < limit
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def loose_pixels(phase, sigma, reasons, field, factor, floor, noise, least, out):
-    """Pixels that continue the surface of fewer than `least` of their eight neighbours: they stand on a jump."""
+    """Pixels that stand on a jump: they continue the surface of fewer than `least` of their eight neighbours.
+
+    The eight at distance two may stand in for the next ones: on a Bayer sensor these are of the pixel's own colour, and
+    often the only ones with enough light.
+    """
     H, W = phase.shape
     for i in prange(H):
         for j in range(W):
             out[i, j] = False
             if reasons[i, j] != 0:
                 continue
-            links = 0
-            for y in range(max(i - 1, 0), min(i + 2, H)):
-                for x in range(max(j - 1, 0), min(j + 2, W)):
-                    if (y == i and x == j) or reasons[y, x] != 0:
-                        continue
-                    if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
-                        links += 1
-            out[i, j] = links < least
+            most = 0
+            for distance in range(1, 3):
+                links = 0
+                for dy in range(-distance, distance + 1, distance):
+                    for dx in range(-distance, distance + 1, distance):
+                        y = i + dy
+                        x = j + dx
+                        if (dy == 0 and dx == 0) or not (0 <= y < H and 0 <= x < W) or reasons[y, x] != 0:
+                            continue
+                        if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+                            links += 1
+                most = max(most, links)
+            out[i, j] = most < least
 
 
 @njit(cache=True, error_model="numpy")
@@ -116,9 +125,9 @@ def _root(parent, a):
 
 @njit(cache=True, error_model="numpy")
 def domains(phase, sigma, reasons, field, factor, floor, noise, label):
-    """Contiguous domains of four-connected pixels that are `linked` (union-find): labels (H, W) int32, -1 = masked.
+    """Contiguous domains of pixels that are `linked` (union-find): labels (H, W) int32, -1 = masked.
 
-    Returns the number of pixels of every label.
+    Links go to the next pixel in the row and the column, and over one masked pixel to the next but one. Returns the number of pixels of every label.
     """
     H, W = phase.shape
     parent = np.arange(H * W)
@@ -129,6 +138,9 @@ def domains(phase, sigma, reasons, field, factor, floor, noise, label):
             for back in range(2):
                 y = i - back
                 x = j - 1 + back
+                if y >= 0 and x >= 0 and reasons[y, x] != 0:
+                    y -= back
+                    x -= 1 - back
                 if y < 0 or x < 0 or reasons[y, x] != 0:
                     continue
                 if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
