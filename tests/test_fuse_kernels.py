@@ -52,9 +52,10 @@ def test_doubles_equal_brute_force(seed):
     lookup = np.full((10, 10), -1, np.int64)
     lookup.ravel()[unique] = np.arange(len(unique))
     out = np.zeros(60, bool)
-    kernels.doubles(
-        ab[order], view[order], np.full(60, reach), np.append(start, 60), unique // 10, unique % 10, lookup, out
-    )
+    flat = np.zeros((60, 3), np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (60, 1))
+    starts, rows, columns = np.append(start, 60), unique // 10, unique % 10
+    kernels.doubles(ab[order], flat, up, view[order], reach, 0.0, 0.0, starts, rows, columns, lookup, out)
     want = reference.doubles(ab, view, reach, order)
     np.testing.assert_array_equal(out, want[order])
     kept = order[~out]
@@ -164,3 +165,14 @@ def test_bow_tie_loses_its_smaller_fan():
     drop = np.zeros(3, bool)
     assert mesh_kernels.bow_ties(faces, start, order // 3, np.empty(9, np.int64), drop) == 1
     np.testing.assert_array_equal(drop, [False, False, True])
+
+
+def test_points_above_each_other_on_a_wall_are_doubles():
+    ab, xyz = np.array([[0.5, 0.5], [0.62, 0.5]]), np.float32([[0, 0, 0], [0.12, 0, 0.01]])
+    wall = np.float32([[1, 0, 0], [1, 0, 0]])
+    lookup = np.zeros((1, 1), np.int64)
+    for near, gone in ((0.5, [True, False]), (0.1, [False, False])):
+        out = np.zeros(2, bool)
+        one = np.zeros(1, np.int64)
+        kernels.doubles(ab, xyz, wall, np.int16([0, 1]), 0.05, 0.05, near, np.array([0, 2]), one, one, lookup, out)
+        np.testing.assert_array_equal(out, gone)

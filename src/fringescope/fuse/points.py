@@ -169,12 +169,12 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
         ns.append(n)
         pictures.append(encode_srgb(colour))
         seen_all.append(seen)
-    own = _ownership(fused, [v.weight for v in views], [v.spacing for v in views], rig, s)
+    own = _ownership(fused, ns, [v.weight for v in views], [v.spacing for v in views], rig, s)
     return Fused(tuple(fused), tuple(ns), tuple(pictures), tuple(own), tuple(seen_all),
                  tuple(v.spacing for v in views), gains)
 
 
-def _ownership(grids: Sequence[Grid], weights: Sequence[F32], spacings: Sequence[float], rig: Rig,
+def _ownership(grids: Sequence[Grid], ns: Sequence[F32], weights: Sequence[F32], spacings: Sequence[float], rig: Rig,
                s: FuseSettings) -> list[Bool]:
     """Which points make the one layer.
 
@@ -217,25 +217,28 @@ def _ownership(grids: Sequence[Grid], weights: Sequence[F32], spacings: Sequence
         mine = np.empty(ab.shape[:2], np.bool_)
         k.owned(ab, low, cell, owner, i, mine)
         own.append(mine)
-    _drop_doubles(coordinates, own, owner, low, cell, separation)
+    _drop_doubles(grids, ns, coordinates, own, owner, low, cell, separation, 1.05 * s.separation_mm, 3 * cell * depth)
     return own
 
 
-def _drop_doubles(coordinates: Sequence[F64], own: Sequence[Bool], owner: AnyArray, low: F64, cell: float,
-                  separation: float) -> None:
+def _drop_doubles(grids: Sequence[Grid], ns: Sequence[F32], coordinates: Sequence[F64], own: Sequence[Bool],
+                  owner: AnyArray, low: F64, cell: float, separation: float, sideways: float, near: float) -> None:
     """Clear from `own` the points that lie within the separation of another view's point."""
     lowest = cv2.erode(owner, np.ones((3, 3), np.uint8))
     edge = (cv2.dilate(owner, np.ones((3, 3), np.uint8)) != lowest) & (owner >= 0)
-    where, ab, cells, views = [], [], [], []
+    where, ab, cells, views, xyz, normal = [], [], [], [], [], []
     for i, mine in enumerate(own):
         at = np.argwhere(mine)
         p = coordinates[i][mine]
         c = ((p - low) / cell).astype(np.int64)
-        near = edge[c[:, 1], c[:, 0]]
-        where.append(at[near])
-        ab.append(p[near])
-        cells.append(c[near, 1] * owner.shape[1] + c[near, 0])
-        views.append(np.full(int(near.sum()), i, np.int16))
+        close = edge[c[:, 1], c[:, 0]]
+        at = at[close]
+        where.append(at)
+        xyz.append(grids[i].xyz[at[:, 0], at[:, 1]])
+        normal.append(ns[i][at[:, 0], at[:, 1]])
+        ab.append(p[close])
+        cells.append(c[close, 1] * owner.shape[1] + c[close, 0])
+        views.append(np.full(int(close.sum()), i, np.int16))
     index, points, view = np.concatenate(cells), np.concatenate(ab), np.concatenate(views)
     if not len(index):
         return
@@ -244,7 +247,8 @@ def _drop_doubles(coordinates: Sequence[F64], own: Sequence[Bool], owner: AnyArr
     lookup = np.full(owner.shape, -1, np.int64)
     lookup.ravel()[unique] = np.arange(len(unique))
     out = np.zeros(len(order), np.bool_)
-    k.doubles(points[order], view[order], np.full(len(order), separation), np.append(start, len(order)),
+    k.doubles(points[order], np.concatenate(xyz)[order], np.concatenate(normal)[order], view[order], separation,
+              sideways, near, np.append(start, len(order)),
               unique // owner.shape[1], unique % owner.shape[1], lookup, out)
     gone = np.zeros(len(order), np.bool_)
     gone[order[out]] = True

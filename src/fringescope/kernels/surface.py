@@ -326,8 +326,11 @@ def owned(ab, origin, cell, owner, view, out):
 
 
 @njit(cache=True, error_model="numpy")
-def doubles(ab, view, reach, cell_start, cell_row, cell_col, lookup, out):
-    """Which points (n,) lie within their `reach` (n,) of a kept point of another view, in the plane `ab` (n, 2).
+def doubles(ab, xyz, normal, view, reach, sideways, near, cell_start, cell_row, cell_col, lookup, out):
+    """Which points (n,) lie too near a kept point of another view.
+
+    Too near is less than `reach` in the plane `ab` (n, 2), or a distance below `near` in space of which less than
+    `sideways` lies in the tangent plane of one of the two (`xyz`, `normal` (n, 3), mm).
 
     Points come sorted by cell: cell k holds cell_start[k] to cell_start[k + 1], at (cell_row[k], cell_col[k]), and
     `lookup` (rows, cols) is k or -1; cells are at least `reach` wide. The first kept point wins.
@@ -344,6 +347,15 @@ def doubles(ab, view, reach, cell_start, cell_row, cell_col, lookup, out):
                         if view[b] == view[a] or out[b]:
                             continue
                         x, y = ab[a, 0] - ab[b, 0], ab[a, 1] - ab[b, 1]
-                        if x * x + y * y < reach[a] * reach[a]:
+                        if x * x + y * y < reach * reach:
+                            out[a] = True
+                            break
+                        x, y, z = xyz[a, 0] - xyz[b, 0], xyz[a, 1] - xyz[b, 1], xyz[a, 2] - xyz[b, 2]
+                        far = x * x + y * y + z * z
+                        if far > near * near:
+                            continue
+                        up = x * normal[a, 0] + y * normal[a, 1] + z * normal[a, 2]
+                        above = x * normal[b, 0] + y * normal[b, 1] + z * normal[b, 2]
+                        if far - max(up * up, above * above) < sideways * sideways:
                             out[a] = True
                             break
