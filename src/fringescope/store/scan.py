@@ -138,6 +138,7 @@ def put_scan(
             {"view": g.view, "camera": g.camera, "size": list(g.reasons.shape[::-1]), **verdicts.get(g.camera, {})}
             for g in scan.grids
         ],
+        "filters": plain(scan.figures.get("filters", [])),
         "figures": plain(scan.figures),
         "times_s": plain(times_s or {}),
         "settings": plain(settings),
