@@ -286,13 +286,14 @@ def test_versions(tmp_path: Path, what: str, reader: Any, version: Any, says: st
 
 
 def a_scan() -> Scan:
+    rng = np.random.default_rng(3)
     grids = []
     for i in range(2):
-        xyz = RNG.normal(size=(6, 9, 3)).astype(np.float32)
+        xyz = rng.normal(size=(6, 9, 3)).astype(np.float32)
         reasons = np.zeros((6, 9), np.uint16)
         reasons[0] = Reason.NOT_LOCAL | Reason.DARK
         xyz[0] = np.nan
-        sigma = RNG.uniform(size=(6, 9)).astype(np.float32)
+        sigma = rng.uniform(size=(6, 9)).astype(np.float32)
         grids.append(Grid(i, f"camera{i + 1}", xyz, sigma, reasons))
     n = 5
     cloud = Cloud(
@@ -327,10 +328,7 @@ def write_a_scan(folder: Path, **more: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("grids", [True, False])
 def test_scan_comes_back(tmp_path: Path, grids: bool) -> None:
-    global RNG
-    RNG = np.random.default_rng(3)
     doc = write_a_scan(tmp_path / "s", grids=grids)
-    RNG = np.random.default_rng(3)
     expected = a_scan()
     back = store.read_scan(tmp_path / "s")
     assert back.document == doc
