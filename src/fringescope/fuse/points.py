@@ -82,6 +82,15 @@ def normals(grid: Grid, rig: Rig, s: FuseSettings | None = None) -> F32:
     return out
 
 
+def _close(mask: Bool, reach: float) -> Bool:
+    """The mask with holes narrower than twice `reach` pixels closed; outside the picture there is none."""
+    margin = math.ceil(reach) + 1
+    hole = cv2.copyMakeBorder((~mask).astype(np.uint8), *[margin] * 4, cv2.BORDER_CONSTANT, value=1)
+    grown = (cv2.distanceTransform(hole, cv2.DIST_L2, 5) <= reach).astype(np.uint8)
+    inside = cv2.distanceTransform(grown, cv2.DIST_L2, 5)[margin:-margin, margin:-margin]
+    return np.asarray(inside > reach) | mask
+
+
 def _rise(mask: Bool, width: float) -> F32:
     """0 outside the mask, rising smoothly to 1 at `width` pixels from its border; the picture's edge is a border."""
     padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
@@ -100,10 +109,7 @@ def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: Fu
     found = step[np.isfinite(step)]
     spacing = float(np.median(found)) if len(found) else 0.0
     valid = np.isfinite(grid.xyz[..., 0])
-    reach = max(1, round(0.5 * s.hole_mm / spacing)) if spacing > 0 else 1
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    padded = cv2.copyMakeBorder(valid.astype(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
-    whole = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disk)[reach:-reach, reach:-reach] > 0
+    whole = _close(valid, max(1.0, 0.5 * s.hole_mm / spacing) if spacing > 0 else 1.0)
     jump = np.empty(valid.shape, np.bool_)
     k.jumps(grid.xyz, grid.sigma, centre, s.max_slope, s.jump_sigma, jump)
     whole &= ~jump
