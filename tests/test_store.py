@@ -376,7 +376,9 @@ def test_decoded_folder(tmp_path: Path) -> None:
         NoiseModel(1, 0),
     )
     blank = np.zeros((7, 9, 3), np.uint8)
-    doc = store.write_decoded(tmp_path / "d", [(d, flat, flat)], settings={}, capture_hash="sha256:0", pictures=lambda _: {"a": blank})
+    doc = store.write_decoded(
+        tmp_path / "d", [(d, flat, flat)], settings={}, capture_hash="sha256:0", pictures=lambda _: {"a": blank}
+    )
     names = {p.name for p in (tmp_path / "d/camera1").iterdir() if not p.name.startswith("preview")}
     assert names == {"phase_0.tif", "phase_1.tif", "modulation.tif", "background.tif", "u.tif", "v.tif", "reasons.png"}
     assert (tmp_path / "d/camera1/preview-a.png").is_file()
