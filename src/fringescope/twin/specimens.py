@@ -91,7 +91,7 @@ class Specimen:
 
 
 SPECIMENS: dict[str, Specimen] = {
-    "tissue-domed": Specimen(domed, HEART, 0.10, 0.18, 3.0),
+    "tissue-domed": Specimen(domed, HEART, 0.10, 0.18, 2.6),
     "tissue-folded": Specimen(folded, GUT, 0.12, 0.22, 2.2),
     "tissue-thin": Specimen(thin, FASCIA, 0.09, 0.25, 1.4),
 }
