@@ -105,3 +105,14 @@ def test_without_webgl_the_page_says_so_and_shows_the_pictures(tmp_path):
     image = shot(page, tmp_path)
     red = (abs(image - [220, 60, 20]) < 25).all(2)
     assert red.sum() > 500
+
+
+@pytest.mark.parametrize("R", [np.eye(3), np.diag([1, -1, -1.0]), np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])])
+def test_whatever_the_world_the_surface_is_seen_from_outside(R):
+    s = surface(12, 1)
+    turned = Surface((s.vertices @ R.T).astype(np.float32), (s.normals @ R.T).astype(np.float32), s.parts)
+    data = json.loads(re.search(r'json">(.*?)</script>', export.viewer_page(turned), re.S).group(1))
+    T = np.array(data["turned"])
+    np.testing.assert_allclose(T @ T.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T) == pytest.approx(1)
+    assert (turned.normals @ T.T).mean(0)[2] > 0.9

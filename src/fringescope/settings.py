@@ -120,7 +120,6 @@ class MeshSettings(_Section):
     max_edge: float = knob(3.5, "spacings", "longer edges bridge a hole or a shadow and go", "", 1.5)
     jump_slope: float = knob(0.35, "", "an edge that leaves both its ends' tangent planes by more than this share of its length, plus jump_sigma, is a jump", "", 0)
     jump_sigma: float = knob(5.0, "sigma", "noise that is no jump", "", 0)
-    max_error_mm: float = knob(0.03, "mm", "how far the simplified surface may leave the points; more triangles stay where it would", "", 0)
     min_area_mm2: float = knob(0.5, "mm^2", "smaller pieces of surface are crumbs and go", "", 0)
 
 

@@ -19,6 +19,7 @@ from fringescope.kernels import mesh as k
 from fringescope.settings import MeshSettings
 from fringescope.types import F32, U8, AnyArray, Bool, Rig, Surface, SurfacePart
 
+_ANY_ERROR = 1e6  # mm; the number of triangles decides, so that a level has the size that a browser takes
 _MARGIN = 2  # pixels kept around the used part of a picture, so that interpolation has neighbours
 
 
@@ -129,16 +130,19 @@ def _outward(faces: NDArray[np.int64], xyz: F32, rig: Rig) -> NDArray[np.int64]:
     return np.asarray(faces[side != 0])
 
 
-def _simplify(faces: NDArray[np.int64], xyz: F32, triangles: int, error_mm: float) -> NDArray[np.int64]:
-    """At most `triangles` triangles over a subset of the same vertices, unless `error_mm` asks for more."""
+def _simplify(faces: NDArray[np.int64], xyz: F32, triangles: int) -> NDArray[np.int64]:
+    """At most `triangles` triangles over a subset of the vertices, with the least change of shape; borders last."""
     if len(faces) <= triangles:
         return faces
     used, local = np.unique(faces, return_inverse=True)
     index = local.reshape(-1).astype(np.uint32)
     out = np.zeros_like(index)
-    count = meshoptimizer.simplify(
-        out, index, np.ascontiguousarray(xyz[used]), target_index_count=3 * triangles, target_error=error_mm,
-        options=meshoptimizer.SIMPLIFY_LOCK_BORDER | meshoptimizer.SIMPLIFY_ERROR_ABSOLUTE)
+    vertices, count = np.ascontiguousarray(xyz[used]), 0
+    for border in (meshoptimizer.SIMPLIFY_LOCK_BORDER, 0):  # a ragged surface is mostly border
+        count = meshoptimizer.simplify(out, index, vertices, target_index_count=3 * triangles, target_error=_ANY_ERROR,
+                                       options=border | meshoptimizer.SIMPLIFY_ERROR_ABSOLUTE)
+        if count <= 3.03 * triangles:
+            break
     return used[out[:count].reshape(-1, 3)].astype(np.int64)
 
 
@@ -191,7 +195,7 @@ def surface(fused: Fused, rig: Rig, s: MeshSettings | None = None) -> tuple[Surf
         raise EmptyResultError(f"no surface: {len(p.xyz)} points, none with neighbours near enough for a triangle; "
                                "look at the reasons per view, or raise mesh.max_edge")
     levels = []
-    for triangles, error in ((s.triangles, s.max_error_mm), (s.preview_triangles, 4 * s.max_error_mm)):
-        faces = _one_fan(_two_sided(_simplify(faces, p.xyz, triangles, error), p.xyz), len(p.xyz))
+    for triangles in (s.triangles, s.preview_triangles):
+        faces = _one_fan(_two_sided(_simplify(faces, p.xyz, triangles), p.xyz), len(p.xyz))
         levels.append(_assemble(faces, p, fused, rig))
     return tuple(levels)

@@ -85,7 +85,7 @@ def normals(grid: Grid, rig: Rig, s: FuseSettings | None = None) -> F32:
 def _close(mask: Bool, reach: float) -> Bool:
     """The mask with holes narrower than twice `reach` pixels closed; outside the picture there is none."""
     margin = math.ceil(reach) + 1
-    hole = cv2.copyMakeBorder((~mask).astype(np.uint8), *[margin] * 4, cv2.BORDER_CONSTANT, value=1)
+    hole = np.pad((~mask).astype(np.uint8), margin, constant_values=1)
     grown = (cv2.distanceTransform(hole, cv2.DIST_L2, 5) <= reach).astype(np.uint8)
     inside = cv2.distanceTransform(grown, cv2.DIST_L2, 5)[margin:-margin, margin:-margin]
     return np.asarray(inside > reach) | mask
