@@ -69,11 +69,12 @@ def _outside(rig: Rig, name: str, xyz: F32, reasons: U16, margin: float) -> None
     camera, projector = rig.camera(name), rig.projector
     some = xyz[::7, ::7][np.isfinite(xyz[::7, ::7, 2])]
     if not len(some):
-        some = np.asarray(rig.volume.center if rig.volume else geometry.working_point(rig))[None]
+        some = np.array([rig.volume.center if rig.volume else geometry.working_point(rig)], dtype=np.float32)
     z_camera = float(np.median(geometry.transform(camera.pose, some)[:, 2]))
     z_projector = float(np.median(geometry.transform(projector.pose, some)[:, 2]))
     footprint = z_camera / camera.lens.K[0, 0]
-    rim = np.maximum(0.5 * footprint * np.array([projector.lens.K[0, 0], projector.lens.K[1, 1]]) / z_projector, 0.5)
+    units_per_mm = np.array([projector.lens.K[0, 0], projector.lens.K[1, 1]]) / z_projector
+    rim = np.maximum(0.5 * footprint * units_per_mm, 0.5)
     high = np.array(projector.plane_size) - 1 - rim
     for row in range(0, xyz.shape[0], 256):
         block, r = xyz[row : row + 256], reasons[row : row + 256]

@@ -31,7 +31,7 @@ def accumulate(frame, n, cos_n, sin_n, max_value, total, in_phase, quadrature, s
                 squares[i, j] += x * x
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def normal_matrix(clipped, steps):
     """Sums over the samples that are left of 1, cos, sin, cos^2, cos sin, sin^2, as a tuple with 1 first."""
     m00 = m01 = m02 = m11 = m12 = m22 = 0.0
@@ -150,7 +150,7 @@ def merge_brackets(phase, background, modulation, sigma, out):
             out[4, i, j] = best
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _chain(phases, sigmas, freq, i, j, first, order):
     """Follow the sets from coarse to fine from an order of set `first`: absolute phase of the finest and chi squared.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def distort(x, y, lens):
     """Ideal normalised coordinates to distorted ones."""
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
@@ -20,7 +20,7 @@ def distort(x, y, lens):
     return xd, yd
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def distort_jacobian(x, y, lens):
     """`distort` and its derivatives: xd, yd, dxd/dx, dxd/dy (= dyd/dx), dyd/dy."""
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
@@ -35,14 +35,14 @@ def distort_jacobian(x, y, lens):
     return xd, yd, jxx, jxy, jyy
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def to_plane(x, y, lens):
     """Ideal normalised coordinates to plane coordinates (u, v)."""
     xd, yd = distort(x, y, lens)
     return lens[0] * xd + lens[4] * yd + lens[2], lens[1] * yd + lens[3]
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def from_plane(u, v, lens):
     """Plane coordinates to ideal normalised ones: Newton on `distort` to 1e-13; NaN if it fails."""
     yd = (v - lens[3]) / lens[1]
