@@ -54,7 +54,7 @@ def measure(
                 sums[i].finish()  # raises and names the missing frames
             raise CaptureError(f"view '{plan.camera}': no frames came for set {i + 1} of {len(plan.sets)} ({one})")
     measured = rescue([done[i] for i in sorted(done)])
-    shapes = {m.phase.shape for m in measured}
+    shapes = {m.phase.shape for m in measured} | {b.shape for b in bits.values()}
     if len(shapes) > 1:
         sizes = ", ".join(f"{c} x {r}" for r, c in sorted(shapes))
         raise CaptureError(f"view '{plan.camera}': sets of different sizes: {sizes}; needed one size")
@@ -80,9 +80,9 @@ def _with_sigma(m: Measured, noise: NoiseModel, s: PhaseSettings) -> WrappedSet:
         m.phase, m.background, m.modulation, m.clipped, m.steps, noise.a, noise.b, allowed, sigma, lost
     )
     if m.lent is not None:  # two samples fix cos and sin; the lent background adds its share: twice the usual formula
-        v = noise.a + noise.b * m.background[m.lent]
+        v = noise.variance(m.background[m.lent])
         sigma[m.lent] = np.sqrt(2 * v) / np.maximum(m.modulation[m.lent], 1e-6)
-    misfit = np.sqrt(m.variance / (noise.a + noise.b * np.maximum(m.background, 0))).astype(np.float32)
+    misfit = np.sqrt(m.variance / noise.variance(m.background))
     gx, gy = m.fringe_set.cycles_per_pixel
     return WrappedSet(
         (float(gx), float(gy)), m.steps, m.phase, m.background, m.modulation, sigma, lost, misfit

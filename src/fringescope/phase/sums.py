@@ -16,9 +16,14 @@ from fringescope.types import F32, F64, AnyArray, FringeSet, GrayCode, GraySet, 
 def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
     """One sample per pixel: raw Bayer and mono frames as they are, RGB as the sum of its channels (uint16).
 
-    A pixel with one saturated channel counts as saturated: it gets the largest sum.
+    A pixel with one saturated channel counts as saturated: it gets the largest sum. Raises CaptureError if the frame is
+    not (H, W), or (H, W, 3) for RGB.
     """
-    if frame.ndim == 2:
+    rgb = pixel_format is PixelFormat.RGB8
+    if frame.ndim != (3 if rgb else 2) or (rgb and frame.shape[2] != 3):
+        needed = "(H, W, 3)" if rgb else "(H, W)"
+        raise CaptureError(f"a frame of shape {frame.shape}; {pixel_format.value} needs {needed}")
+    if not rgb:
         return np.ascontiguousarray(frame)
     total: AnyArray = frame.astype(np.uint16).sum(axis=2, dtype=np.uint16)
     total[(frame >= pixel_format.max_value).any(axis=2)] = 3 * pixel_format.max_value
@@ -89,7 +94,7 @@ class FringeSums:
     def finish(self) -> Measured:
         """The least-squares sinusoid of each pixel's unsaturated samples.
 
-        Raises CaptureError if frames are missing.
+        Where all are saturated the background is full scale. Raises CaptureError if frames are missing.
         """
         N = self.fringe_set.steps
         missing = sorted(set(range(N)) - self._seen)
@@ -98,6 +103,7 @@ class FringeSums:
         shape = self._clipped.shape
         phase, background, modulation, variance = (np.empty(shape, np.float32) for _ in range(4))
         k.wrap(*self._sums, self._clipped, N, phase, background, modulation, variance)
+        background[np.isinf(background)] = self.max_value
         index = np.flatnonzero(_left(self._clipped, N) == 2) if (self._clipped != 0).any() else np.zeros(0, np.intp)
         poor = (index, self._sums[1].ravel()[index], self._sums[2].ravel()[index])
         self._sums = []
@@ -151,7 +157,9 @@ class GrayBits:
         self._frames: dict[tuple[Role, int], AnyArray] = {}
 
     def add(self, role: Role, n: int, frame: AnyArray) -> None:
-        """Add one frame (H, W). Raises CaptureError for another size."""
+        """Add one frame (H, W). Raises CaptureError for a second one of its kind or another size."""
+        if (role, n) in self._frames:
+            raise CaptureError(f"{role.value} frame {n} of a Gray code came twice; each once")
         for other in self._frames.values():
             if other.shape != frame.shape:
                 raise CaptureError(
@@ -161,12 +169,23 @@ class GrayBits:
             break
         self._frames[role, n] = frame
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W) of the frames that came."""
+        return next((f.shape for f in self._frames.values()), (0, 0))
+
     def finish(self, noise: NoiseModel) -> GrayCode:
-        """Decode: each bit against its inverse, or the mean of white and black, or the mean of all bits."""
+        """Decode: each bit against its inverse, or the mean of white and black, or the mean of all bits.
+
+        Raises CaptureError if frames that the set promises are missing.
+        """
         s, f = self.gray_set, self._frames
-        missing = [n for n in range(s.bits) if (Role.BIT, n) not in f]
+        needed = [(Role.BIT, n) for n in range(s.bits)]
+        needed += [(Role.INVERSE, n) for n in range(s.bits)] if s.inverse else []
+        needed += [(role, 0) for role, there in ((Role.WHITE, s.white), (Role.BLACK, s.black)) if there]
+        missing = ", ".join(f"{role.value} {n}" for role, n in needed if (role, n) not in f)
         if missing:
-            raise CaptureError(f"a Gray code of {s.bits} frames lacks {missing}")
+            raise CaptureError(f"a Gray code of {s.bits} bits got {len(f)} of {len(needed)} frames; missing {missing}")
         first = f[Role.BIT, 0]
         none = np.zeros((0, 0), first.dtype)
         if (Role.WHITE, 0) in f and (Role.BLACK, 0) in f:
@@ -176,7 +195,7 @@ class GrayBits:
             threshold = 0.5 * (np.maximum.reduce(bits) + np.minimum.reduce(bits))
         code = np.zeros(first.shape, np.int32)
         contrast = np.zeros(first.shape, np.float32)
-        level = math.sqrt(noise.a + noise.b * float(np.median(threshold)))
+        level = math.sqrt(float(noise.variance(np.median(threshold))))
         for n in range(s.bits):
             inverse = f.get((Role.INVERSE, n), none)
             k.gray_bit(f[Role.BIT, n], inverse, threshold.astype(np.float32), 2.0 * level, n, code, contrast)
