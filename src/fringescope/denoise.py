@@ -47,7 +47,7 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
         out[s.min_modulation * scale > B] |= np.uint16(Reason.LOW_MODULATION)
         return out
     dark = s.min_background * scale > A
-    noise = np.sqrt(decoded.noise.a + decoded.noise.b * np.maximum(A, 0))
+    noise = np.sqrt(decoded.noise.variance(A))
     low = (s.min_modulation * scale > B) | (s.min_contrast * A > B) | (s.min_modulation_sigma * noise > B)
     out[dark] |= np.uint16(Reason.DARK)
     out[low] |= np.uint16(Reason.LOW_MODULATION)

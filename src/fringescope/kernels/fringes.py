@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 TWO_PI = 2.0 * math.pi
+ROUNDING = 1.0 / 12.0  #: least variance of a sample, codes squared
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -120,7 +121,7 @@ def phase_sigma(phase, background, modulation, clipped, steps, a, b, max_clipped
                 gain = (jc * jc * c11 + 2.0 * jc * js * c12 + js * js * c22) / det
             elif steps == 3:
                 v -= 0.5 * b * B * math.cos(3.0 * phase[i, j])
-            out[i, j] = math.sqrt(gain * max(v, 0.0)) / B if B > 0.0 else np.inf
+            out[i, j] = math.sqrt(gain * max(v, ROUNDING)) / B if B > 0.0 else np.inf
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -150,7 +151,7 @@ def merge_brackets(phase, background, modulation, sigma, out):
             out[4, i, j] = best
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _chain(phases, sigmas, freq, i, j, first, order):
     """Follow the sets from coarse to fine from an order of set `first`: absolute phase of the finest and chi squared.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def distort(x, y, lens):
     """Ideal normalised coordinates to distorted ones."""
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
@@ -20,7 +20,7 @@ def distort(x, y, lens):
     return xd, yd
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def distort_jacobian(x, y, lens):
     """`distort` and its derivatives: xd, yd, dxd/dx, dxd/dy (= dyd/dx), dyd/dy."""
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
@@ -35,7 +35,7 @@ def distort_jacobian(x, y, lens):
     return xd, yd, jxx, jxy, jyy
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def to_plane(x, y, lens):
     """Ideal normalised coordinates to plane coordinates (u, v)."""
     xd, yd = distort(x, y, lens)

@@ -10,7 +10,7 @@ from fringescope.kernels.lens import distort_jacobian, from_plane
 TWO_PI = 2.0 * math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def plane_depth(g0, g1, cycles, a0, a1, a2, b0, b1, b2, lens):
     """Depth d where the point d a + b (projector frame) lies on the equiphase plane of a distortion-free projector.
 
@@ -22,7 +22,7 @@ def plane_depth(g0, g1, cycles, a0, a1, a2, b0, b1, b2, lens):
     return -(kx * b0 + ky * b1 + kz * b2) / (kx * a0 + ky * a1 + kz * a2)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def cycles_along(d, g0, g1, a0, a1, a2, b0, b1, b2, lens):
     """Cycles that a projector with distortion throws on the point d a + b, and their derivative by d."""
     X = d * a0 + b0

@@ -8,7 +8,7 @@ from numba import njit, prange
 from fringescope.kernels.lens import to_plane
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _spread(field, i, j, H, W, c):
     """Channel c of a coarse field (h, w, C) that spans the image corner on corner, at pixel (i, j)."""
     h, w = field.shape[0], field.shape[1]
@@ -75,7 +75,7 @@ def majority_backward(signs, radius, share, least, out):
                 out[i, j] = True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
     """Whether two pixels in one row or column or diagonal continue one surface: their phases differ by less than T1.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -9,6 +10,9 @@ import numpy as np
 
 from fringescope.phase.sums import Measured
 from fringescope.types import AnyArray, NoiseModel
+from fringescope.types.capture import ROUNDING
+
+SAMPLES = 100_000  #: pixels that are enough to tell the noise
 
 
 def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
@@ -22,15 +26,18 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
     variances: list[float] = []
     weights: list[float] = []
     samples: list[tuple[AnyArray, AnyArray, int]] = []
+    thin = max(1, round(math.sqrt(measured[0].phase.size / SAMPLES))) if measured else 1
+    cut = (slice(None, None, thin), slice(None, None, thin))
     for m in measured:
         if m.steps > 3:
-            ok = m.clipped == 0
-            samples.append((m.background[ok], m.variance[ok], m.steps - 3))
+            ok = m.clipped[cut] == 0
+            samples.append((m.background[cut][ok], m.variance[cut][ok], m.steps - 3))
     if not samples:
         for m1, m2 in pairwise(measured):
             if m1.phase.shape == m2.phase.shape and m1.fringe_set.exposure_us == m2.fringe_set.exposure_us:
-                ok = (m1.clipped == 0) & (m2.clipped == 0)
-                A, d = m1.background[ok], (m1.background[ok] - m2.background[ok]).astype(np.float64)
+                ok = (m1.clipped[cut] == 0) & (m2.clipped[cut] == 0)
+                A = m1.background[cut][ok]
+                d = A.astype(np.float64) - m2.background[cut][ok]
                 d -= np.median(d) if d.size else 0.0
                 samples.append((A, d * d / (1 / m1.steps + 1 / m2.steps), 1))
     for A, v, dof in samples:
@@ -46,23 +53,22 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
                 levels.append(float(level[inside].mean()))
                 variances.append(float(np.median(rest[inside])) / _chi2_median(dof))
                 weights.append(float(inside.sum()) * dof)
-    floor = 1.0 / 12.0
     if len(levels) < 3:
         scale = max_value / 255.0
         return NoiseModel(0.36 * scale * scale, 0.03 * scale, "default")
-    x, y, w = np.array(levels), np.array(variances), np.array(weights)
-    w = w / np.maximum(y, floor) ** 2
-    for _ in range(5):  # iteratively reweighted: bins spoilt by motion or gamma lie above the line
-        M = np.stack([np.ones_like(x), x], 1)
-        a, b = (float(c) for c in np.linalg.lstsq(M * np.sqrt(w)[:, None], y * np.sqrt(w), rcond=None)[0])
-        if b < 0:
-            a, b = float(np.average(y, weights=w)), 0.0
-        if a < floor:
-            a, b = floor, max(float(np.sum(w * x * (y - floor)) / np.sum(w * x * x)), 0.0)
-        r = (y - a - b * x) / np.maximum(a + b * x, floor)
-        scale = 1.4826 * float(np.median(np.abs(r))) + 1e-3
-        w = np.array(weights) / np.maximum(a + b * x, floor) ** 2 / (1 + (r / (3 * scale)) ** 2)
-    return NoiseModel(float(a), float(b), "residuals")
+    x, y = np.array(levels), np.maximum(np.array(variances), ROUNDING)
+    w = np.array(weights) / y**2
+    intercept, slope = 0.0, 0.0
+    for _ in range(8):  # iteratively reweighted: bins spoilt by motion or gamma lie above the line
+        mean = float(np.average(x, weights=w))
+        level = float(np.average(y, weights=w))
+        slope = max(float(np.sum(w * (x - mean) * (y - level)) / max(np.sum(w * (x - mean) ** 2), 1e-12)), 0.0)
+        intercept = level - slope * mean
+        line = np.maximum(intercept + slope * x, ROUNDING)
+        off = (y - line) / line
+        scatter = 1.4826 * float(np.median(np.abs(off))) + 1e-3
+        w = np.array(weights) / line**2 / (1 + (off / (3 * scatter)) ** 2)
+    return NoiseModel(intercept, slope, "residuals")
 
 
 def _chi2_median(dof: int) -> float:

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
+import numpy as np
+
 from fringescope.errors import CaptureError
-from fringescope.types.names import AnyArray, Layout, PixelFormat
+from fringescope.types.names import F32, AnyArray, Layout, PixelFormat
+
+ROUNDING = 1.0 / 12.0  #: variance of rounding to whole codes, codes squared
 
 
 @dataclass(frozen=True)
@@ -125,11 +129,18 @@ class PatternPlan:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of one raw sample in codes squared: `a + b I` at intensity I (codes)."""
+    """Variance of one raw sample in codes squared: `a + b I` at intensity I (codes), at least that of the rounding.
+
+    `a` is negative on a sensor with a black level: its shot noise begins above the level.
+    """
 
     a: float
     b: float
     source: str = "default"  #: "residuals", "capture.json" or "default"
+
+    def variance(self, intensity: F32) -> F32:
+        """Variance of samples of these intensities, codes squared, same shape."""
+        return np.maximum(np.float32(self.a) + np.float32(self.b) * intensity, np.float32(ROUNDING)).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
