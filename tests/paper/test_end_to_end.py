@@ -1,4 +1,4 @@
-"""The simulated instrument, through the devices, to the surface: every preset, every specimen, judged by exact truth."""
+"""The simulated instrument, through the devices, to the surface: every preset and specimen, against exact truth."""
 
 from __future__ import annotations
 

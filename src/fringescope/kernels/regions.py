@@ -127,7 +127,8 @@ def _root(parent, a):
 def domains(phase, sigma, reasons, field, factor, floor, noise, label):
     """Contiguous domains of pixels that are `linked` (union-find): labels (H, W) int32, -1 = masked.
 
-    Links go to the next pixel in the row and the column, and over one masked pixel to the next but one. Returns the number of pixels of every label.
+    Links go to the next pixel in the row and the column, and over one masked pixel to the next but one. Returns the
+    number of pixels of every label.
     """
     H, W = phase.shape
     parent = np.arange(H * W)

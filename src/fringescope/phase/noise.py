@@ -61,9 +61,10 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
     intercept, slope = 0.0, 0.0
     for _ in range(8):  # iteratively reweighted: bins spoilt by motion or gamma lie above the line
         mean = float(np.average(x, weights=w))
-        level = float(np.average(y, weights=w))
-        slope = max(float(np.sum(w * (x - mean) * (y - level)) / max(np.sum(w * (x - mean) ** 2), 1e-12)), 0.0)
-        intercept = level - slope * mean
+        middle = float(np.average(y, weights=w))
+        spread = max(float(np.sum(w * (x - mean) ** 2)), 1e-12)
+        slope = max(float(np.sum(w * (x - mean) * (y - middle))) / spread, 0.0)
+        intercept = middle - slope * mean
         line = np.maximum(intercept + slope * x, ROUNDING)
         off = (y - line) / line
         scatter = 1.4826 * float(np.median(np.abs(off))) + 1e-3
