@@ -140,7 +140,8 @@ class NoiseModel:
 
     def variance(self, intensity: F32) -> F32:
         """Variance of samples of these intensities, codes squared, same shape."""
-        return np.maximum(np.float32(self.a) + np.float32(self.b) * intensity, np.float32(ROUNDING)).astype(np.float32)
+        line = np.float32(self.a) + np.float32(self.b) * np.asarray(intensity, dtype=np.float32)
+        return np.asarray(np.maximum(line, np.float32(ROUNDING)), dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
