@@ -28,7 +28,8 @@ def grid(
     `reasons` (H, W): pixels with any bit get no point. Several directions are weighted by 1 / sigma^2; where they
     disagree by more than `max_miss` standard deviations the pixel is ORDER_UNCERTAIN. Points outside the measuring
     space are OUT_OF_VOLUME. `pinhole` leaves out both lenses' distortion (the paper's equation 15).
-    Raises DecodeError if the orders are not settled, RigError if the rig lacks the camera or its size differs.
+    Raises DecodeError if the orders are not settled or the frames are not of the size that the rig was calibrated at,
+    RigError if the rig lacks the camera.
     """
     camera, projector = rig.camera(decoded.camera), rig.projector
     H, W = decoded.shape
