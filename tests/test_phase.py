@@ -134,6 +134,15 @@ def test_two_samples_and_a_lent_background_still_tell_the_order(rng):
     judge(decoded, u, v, good=0.9)
 
 
+def test_a_lent_background_does_not_excuse_more_blown_samples_than_allowed(rng):
+    """Six of eight are blown; another set could lend its background, but a phase of two neighbours is no phase."""
+    plan, frames, *_ = capture(core.fringes(450, steps=16), core.fringes(14, steps=8), A=4750, B=1500, rng=rng)
+    fine = phase.measure(frames, plan, S, NoiseModel(*NOISE)).sets[1]
+    many = fine.saturated == 6
+    assert many.mean() > 0.1
+    assert np.isinf(fine.sigma[many]).all()
+
+
 # ------------------------------------------------------------------------------------------------------- bad captures
 
 

@@ -80,8 +80,9 @@ def _with_sigma(m: Measured, noise: NoiseModel, s: PhaseSettings) -> WrappedSet:
         m.phase, m.background, m.modulation, m.clipped, m.steps, noise.a, noise.b, allowed, sigma, lost
     )
     if m.lent is not None:  # two samples fix cos and sin; the lent background adds its share: twice the usual formula
-        v = noise.variance(m.background[m.lent])
-        sigma[m.lent] = np.sqrt(2 * v) / np.maximum(m.modulation[m.lent], 1e-6)
+        lent = m.lent & (lost <= allowed)
+        v = noise.variance(m.background[lent])
+        sigma[lent] = np.sqrt(2 * v) / np.maximum(m.modulation[lent], 1e-6)
     misfit = np.sqrt(m.variance / noise.variance(m.background))
     gx, gy = m.fringe_set.cycles_per_pixel
     return WrappedSet(
