@@ -40,10 +40,11 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "errors": (set(), "the bottom"),
     "types": ({"errors"}, "data, no behaviour"),
     "settings": ({"errors"}, "data, no behaviour"),
-    "kernels": (set(), "arrays in, arrays out: they know no dataclass, file or device"),
+    "threads": (set(), "rows on all cores: knows nothing of what the rows hold"),
+    "kernels": ({"threads"}, "arrays in, arrays out: they know no dataclass, file or device"),
     "geometry": (DATA | {"kernels"}, "poses and lenses on top of the lens kernels"),
     **dict.fromkeys(STAGES, (BOTTOM, "stages never import each other: what passes between them is a type")),
-    "twin": (DATA, "the judge shares no maths with the judged"),
+    "twin": (DATA | {"threads"}, "the judge shares no maths with the judged"),
     "devices": (DATA, "a device knows what it is asked, not who asks"),
     "devices.simulated": (DATA | {"twin"}, "the twin posing as devices"),
     "devices.replay": (DATA | {"store"}, "a stored capture posing as devices"),
@@ -64,7 +65,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 #: Packages that only some units may import, and which.
 CONFINED = {
-    "numba": {"kernels", "twin"},
+    "numba": {"kernels", "threads", "twin"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"report", "evaluate"},

@@ -82,7 +82,7 @@ def world_rays(device: Camera | Projector, uv: ArrayLike) -> tuple[F64, F64]:
 def pixel_rays(lens: Lens) -> F64:
     """Ideal normalised coordinates (H, W, 2) of every pixel centre of a camera."""
     out = np.empty((lens.height, lens.width, 2))
-    k.pixel_rays(lens.height, lens.width, lens_vector(lens), out)
+    k.pixel_rays(lens_vector(lens), out)
     return out
 
 

@@ -8,19 +8,21 @@ pixel, and depth. Bands of rows are drawn in parallel, each by one thread, so th
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from fringescope.threads import by_rows
 
 BANDS = 16
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def splat(screen, radius, colours, normals, depth, colour, normal):
+@by_rows(lambda *_: BANDS)
+def splat(first, last, screen, radius, colours, normals, depth, colour, normal):
     """Points (n, 3) on the screen as discs of `radius` (n,) pixels that face the viewer; the nearest wins.
 
     A disc's depth grows slightly to its rim, so that overlapping discs meet halfway.
     """
     h, w = depth.shape
-    for band in prange(BANDS):
+    for band in range(first, last):
         top, bottom = band * h // BANDS, (band + 1) * h // BANDS
         for i in range(screen.shape[0]):
             x, y, z, r = screen[i, 0], screen[i, 1], screen[i, 2], radius[i]
@@ -55,8 +57,8 @@ def _texel(texture, x, y, k):
     return top * (1.0 - b) + low * b
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def triangles(screen, faces, normals, uv, texture, depth, colour, normal):
+@by_rows(lambda *_: BANDS)
+def triangles(first, last, screen, faces, normals, uv, texture, depth, colour, normal):
     """Textured triangles, perspective-correct; the nearest wins.
 
     `screen` (n, 3), `normals` (n, 3) and `uv` (n, 2, in 0..1 from the texture's top-left corner) belong to vertices,
@@ -65,7 +67,7 @@ def triangles(screen, faces, normals, uv, texture, depth, colour, normal):
     """
     h, w = depth.shape
     th, tw = texture.shape[0], texture.shape[1]
-    for band in prange(BANDS):
+    for band in range(first, last):
         top, bottom = band * h // BANDS, (band + 1) * h // BANDS
         for f in range(faces.shape[0]):
             ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -115,16 +117,16 @@ def bin_mean(x, y, value, out, count):
             out[v, u] = out[v, u] / count[v, u] if count[v, u] else np.nan
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def light(depth, colour, normal, shade, ss, forward, key, up, half, strength, out, alpha):
+@by_rows(lambda *args: args[-1].shape[0])
+def light(first, last, depth, colour, normal, shade, ss, forward, key, up, half, strength, out, alpha):
     """Light on the buffers of a picture that is `ss` times supersampled, and the mean over each pixel's samples.
 
     Normals and the unit vectors `forward` (viewing direction), `key`, `up`, `half` (3,) are in the world. `shade`
     (h, w) of the final picture: 1 in the open, less in hollows. `strength` = key, sky, gloss, exponent of the shade.
     `out` (h, w, 3) linear, premultiplied; `alpha` (h, w).
     """
-    h, w = alpha.shape
-    for v in prange(h):
+    _h, w = alpha.shape
+    for v in range(first, last):
         for u in range(w):
             hits = 0
             r = g = b = 0.0
@@ -157,11 +159,11 @@ def light(depth, colour, normal, shade, ss, forward, key, up, half, strength, ou
             alpha[v, u] = hits / n
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def reduce_depth(depth, ss, out, weight):
+@by_rows(lambda _depth, _ss, out, *_: out.shape[0])
+def reduce_depth(first, last, depth, ss, out, weight):
     """Mean depth (h, w) of each pixel's `ss` x `ss` samples that hit something, times the share that did."""
-    h, w = out.shape
-    for v in prange(h):
+    _h, w = out.shape
+    for v in range(first, last):
         for u in range(w):
             total, hits = 0.0, 0
             for y in range(v * ss, (v + 1) * ss):

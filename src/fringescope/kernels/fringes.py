@@ -6,20 +6,22 @@ Arrays and scalars only. Angles in radians; intensities in codes; coordinates in
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from fringescope.threads import by_rows
 
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1.0 / 12.0  #: least variance of a sample, codes squared
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def accumulate(frame, n, cos_n, sin_n, max_value, total, in_phase, quadrature, squares, clipped):
+@by_rows(lambda frame, *_: frame.shape[0])
+def accumulate(first, last, frame, n, cos_n, sin_n, max_value, total, in_phase, quadrature, squares, clipped):
     """Add frame n (H, W) to the sums of its set: sum I, sum I cos, sum I sin, sum I^2.
 
     Saturated samples say nothing but "at least this much": they stay out of the sums and set bit n of `clipped`.
     """
     bit = np.uint64(1) << np.uint64(n)
-    for i in prange(frame.shape[0]):
+    for i in range(first, last):
         for j in range(frame.shape[1]):
             raw = frame[i, j]
             if raw >= max_value:
@@ -50,14 +52,14 @@ def normal_matrix(clipped, steps):
     return m00, m01, m02, m11, m12, m22
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def wrap(total, in_phase, quadrature, squares, clipped, steps, phase, background, modulation, variance):
+@by_rows(lambda total, *_: total.shape[0])
+def wrap(first, last, total, in_phase, quadrature, squares, clipped, steps, phase, background, modulation, variance):
     """Sums to the least-squares sinusoid of the samples that are left: wrapped phase in (-pi, pi], A and B.
 
     `variance` is that of the samples about the sinusoid, NaN where none is left over (three samples). Pixels with fewer
     than three samples get phase 0, modulation 0 and the background of what there is.
     """
-    for i in prange(total.shape[0]):
+    for i in range(first, last):
         for j in range(total.shape[1]):
             t, p, q = total[i, j], in_phase[i, j], quadrature[i, j]
             left = float(steps)
@@ -93,14 +95,14 @@ def wrap(total, in_phase, quadrature, squares, clipped, steps, phase, background
                 variance[i, j] = np.nan
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def phase_sigma(phase, background, modulation, clipped, steps, a, b, max_clipped, out, lost):
+@by_rows(lambda phase, *_: phase.shape[0])
+def phase_sigma(first, last, phase, background, modulation, clipped, steps, a, b, max_clipped, out, lost):
     """Standard deviation of the wrapped phase for sample variance a + b I: sqrt(2 (a + b A) / N) / B for N > 3.
 
     Three steps have a further term, -(b B / 2) cos 3 phi; with clipped samples the inverse normal matrix of the rest
     takes the place of 2 / N. Infinite where B is 0 or more than `max_clipped` samples are clipped. `lost` counts them.
     """
-    for i in prange(phase.shape[0]):
+    for i in range(first, last):
         for j in range(phase.shape[1]):
             B = modulation[i, j]
             v = a + b * background[i, j]
@@ -124,14 +126,14 @@ def phase_sigma(phase, background, modulation, clipped, steps, a, b, max_clipped
             out[i, j] = math.sqrt(gain * max(v, ROUNDING)) / B if B > 0.0 else np.inf
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def merge_brackets(phase, background, modulation, sigma, out):
+@by_rows(lambda phase, *_: phase.shape[1])
+def merge_brackets(first, last, phase, background, modulation, sigma, out):
     """Merge HDR brackets (E, H, W) per pixel by inverse variance of the phase; brackets of infinite sigma stay out.
 
     `out` (5, H, W): phase, background, modulation, sigma of the merged measurement, and the number of the best bracket,
     whose background and modulation stand for all, so that they stay within the range of one exposure.
     """
-    for i in prange(phase.shape[1]):
+    for i in range(first, last):
         for j in range(phase.shape[2]):
             best = 0
             s = c = w_sum = 0.0
@@ -179,8 +181,8 @@ def _chain(phases, sigmas, freq, i, j, first, order):
     return absolute, chi2, margin2
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def unwrap(phases, sigmas, freq, bounds, unexpected, gray, gray_half, gray_soft, out, margin):
+@by_rows(lambda phases, *_: phases.shape[1])
+def unwrap(first, last, phases, sigmas, freq, bounds, unexpected, gray, gray_half, gray_soft, out, margin):
     """Absolute phase of the finest of K parallel sets (K, H, W), coarse to fine, by least chi squared (equation 5).
 
     `bounds` (4, h, w) span the image bilinearly, corner on corner. Every order of the coarsest set is tried whose
@@ -196,7 +198,7 @@ def unwrap(phases, sigmas, freq, bounds, unexpected, gray, gray_half, gray_soft,
     h, w = bounds.shape[1], bounds.shape[2]
     K = phases.shape[0]
     use_gray = gray.shape[0] == H
-    for i in prange(H):
+    for i in range(first, last):
         y = i * (h - 1) / max(H - 1, 1)
         y0 = min(int(y), max(h - 2, 0))
         fy = y - y0
@@ -248,8 +250,8 @@ def unwrap(phases, sigmas, freq, bounds, unexpected, gray, gray_half, gray_soft,
             margin[i, j] = min(math.sqrt(max(min(second_chi2 - best_chi2, best_margin2), 0.0)), 99.0)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def order_votes(phase, radius, least, majority, max_slope, out, changed):
+@by_rows(lambda phase, *_: phase.shape[0])
+def order_votes(first, last, phase, radius, least, majority, max_slope, out, changed):
     """Let the neighbours vote on each pixel's order: `out` = phase + 2 pi (elected order - own).
 
     A neighbour votes for the order that brings this pixel nearest to it; votes count only if the wrapped difference is
@@ -257,7 +259,7 @@ def order_votes(phase, radius, least, majority, max_slope, out, changed):
     `changed` gets the elected change of order (int8), or -128 where no order has the majority.
     """
     H, W = phase.shape
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             p = phase[i, j]
             out[i, j] = p
@@ -291,14 +293,14 @@ def order_votes(phase, radius, least, majority, max_slope, out, changed):
                 changed[i, j] = -128
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def gray_bit(frame, inverse, threshold, noise_codes, bit, code, contrast):
+@by_rows(lambda frame, *_: frame.shape[0])
+def gray_bit(first, last, frame, inverse, threshold, noise_codes, bit, code, contrast):
     """Read one Gray-code frame against its inverse (or a threshold image): code = 2 code + bit; -1 where uncertain.
 
     `contrast` keeps the smallest distance from the threshold over the frames, in codes.
     """
     use_inverse = inverse.shape[0] == frame.shape[0]
-    for i in prange(frame.shape[0]):
+    for i in range(first, last):
         for j in range(frame.shape[1]):
             t = float(inverse[i, j]) if use_inverse else threshold[i, j]
             d = float(frame[i, j]) - t

@@ -6,7 +6,9 @@ A lens travels as one float64 vector of ten numbers: fx, fy, u0, v0, skew, k1, k
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from fringescope.threads import by_rows
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -64,10 +66,10 @@ def from_plane(u, v, lens):
     return math.nan, math.nan
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def project_points(p, R, t, lens, out):
+@by_rows(lambda p, *_: p.shape[0])
+def project_points(first, last, p, R, t, lens, out):
     """World points (n, 3) to plane coordinates (n, 2); NaN behind the device."""
-    for i in prange(p.shape[0]):
+    for i in range(first, last):
         X = R[0, 0] * p[i, 0] + R[0, 1] * p[i, 1] + R[0, 2] * p[i, 2] + t[0]
         Y = R[1, 0] * p[i, 0] + R[1, 1] * p[i, 1] + R[1, 2] * p[i, 2] + t[1]
         Z = R[2, 0] * p[i, 0] + R[2, 1] * p[i, 1] + R[2, 2] * p[i, 2] + t[2]
@@ -78,18 +80,18 @@ def project_points(p, R, t, lens, out):
             out[i, 1] = np.nan
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def unproject_points(uv, lens, out):
+@by_rows(lambda uv, *_: uv.shape[0])
+def unproject_points(first, last, uv, lens, out):
     """Plane coordinates (n, 2) to ideal normalised coordinates (n, 2)."""
-    for i in prange(uv.shape[0]):
+    for i in range(first, last):
         out[i, 0], out[i, 1] = from_plane(uv[i, 0], uv[i, 1], lens)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def pixel_rays(height, width, lens, out):
+@by_rows(lambda _lens, out: out.shape[0])
+def pixel_rays(first, last, lens, out):
     """Ideal normalised coordinates (H, W, 2) of every pixel centre."""
-    for i in prange(height):
-        for j in range(width):
+    for i in range(first, last):
+        for j in range(out.shape[1]):
             x, y = from_plane(float(j), float(i), lens)
             out[i, j, 0] = x
             out[i, j, 1] = y

@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fringescope.kernels.lens import distort_jacobian, from_plane
+from fringescope.threads import by_rows
 
 TWO_PI = 2.0 * math.pi
 
@@ -40,16 +41,18 @@ def cycles_along(d, g0, g1, a0, a1, a2, b0, b1, b2, lens):
     return g0 * u + g1 * v, g0 * du + g1 * dv
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def triangulate(phase, sigma, reasons, g, cam_lens, proj_lens, R_pc, t_pc, R_wc, t_wc, xyz, sigma_mm, miss):
+@by_rows(lambda phase, *_: phase.shape[1])
+def triangulate(
+    first, last, phase, sigma, reasons, g, cam_lens, proj_lens, R_pc, t_pc, R_wc, t_wc, xyz, sigma_mm, miss
+):
     """Points of one view: D phases (D, H, W) of gradients g (D, 2) to world xyz (H, W, 3) and sigma along the ray.
 
     One direction: Newton on the depth, from the closed form of the plane, until the phase is met to 1e-9 cycles. More:
     Gauss-Newton, weighted by 1 / sigma^2; `miss` gets the rms misfit of the phases in standard deviations.
     NaN wherever `reasons` is not zero, where no phase is finite, or where the ray misses.
     """
-    D, H, W = phase.shape
-    for i in prange(H):
+    D, _H, W = phase.shape
+    for i in range(first, last):
         for j in range(W):
             xyz[i, j, 0] = np.nan
             xyz[i, j, 1] = np.nan

@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fringescope.kernels.lens import to_plane
+from fringescope.threads import by_rows
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -25,15 +26,15 @@ def _spread(field, i, j, H, W, c):
     )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def gradient_signs(phase, sigma, reasons, field, reach, significance, out):
+@by_rows(lambda phase, *_: phase.shape[0])
+def gradient_signs(first, last, phase, sigma, reasons, field, reach, significance, out):
     """Sign of the phase's growth along the predicted direction (equation 17): 1 forward, -1 backward, 0 unknown.
 
     `field` (h, w, 3) holds the unit direction (du, dv). The difference is taken over `reach` pixels on either side, or
     on one where the other is masked; it must exceed `significance` standard deviations to count.
     """
     H, W = phase.shape
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             out[i, j] = 0
             if reasons[i, j] != 0:
@@ -57,11 +58,11 @@ def gradient_signs(phase, sigma, reasons, field, reach, significance, out):
                 out[i, j] = 1 if a > b else -1
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def majority_backward(signs, radius, share, least, out):
+@by_rows(lambda signs, *_: signs.shape[0])
+def majority_backward(first, last, signs, radius, share, least, out):
     """Where at least `share` of at least `least` signs in the window are backward: a contiguous reversal."""
     H, W = signs.shape
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             out[i, j] = False
             back = votes = 0
@@ -87,15 +88,15 @@ def linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
     return abs(phase[i, j] - phase[y, x]) < limit
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def loose_pixels(phase, sigma, reasons, field, factor, floor, noise, least, out):
+@by_rows(lambda phase, *_: phase.shape[0])
+def loose_pixels(first, last, phase, sigma, reasons, field, factor, floor, noise, least, out):
     """Pixels that stand on a jump: they continue the surface of fewer than `least` of their eight neighbours.
 
     The eight at distance two may stand in for the next ones: on a Bayer sensor these are of the pixel's own colour, and
     often the only ones with enough light.
     """
     H, W = phase.shape
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             out[i, j] = False
             if reasons[i, j] != 0:
@@ -203,8 +204,8 @@ def _solve(M, rhs, n):
     return True, inv00
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def local_surface(phase, sigma, label, radius, least, out, roughness):
+@by_rows(lambda phase, *_: phase.shape[0])
+def local_surface(first, last, phase, sigma, label, radius, least, out, roughness):
     """Distance of each pixel's phase from the surface of its neighbours, in standard deviations; NaN where too few.
 
     The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain in the
@@ -212,7 +213,7 @@ def local_surface(phase, sigma, label, radius, least, out, roughness):
     sigma). `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
     """
     H, W = phase.shape
-    for i in prange(H):
+    for i in range(first, last):
         M = np.empty((6, 6))
         rhs = np.empty(6)
         coefficient = np.zeros(6)
@@ -288,17 +289,17 @@ def local_surface(phase, sigma, label, radius, least, out, roughness):
                 roughness[i, j] = spread
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def cross_examine(xyz, sigma, other, other_sigma, R, t, lens, tolerance, slack, confirmed, denied):
+@by_rows(lambda _xyz, sigma, *_: sigma.shape[0])
+def cross_examine(first, last, xyz, sigma, other, other_sigma, R, t, lens, tolerance, slack, confirmed, denied):
     """Compare a view's points (H, W, 3) with the surface that another camera (pose R, t) sees through its pixels.
 
     The other surface is interpolated between four pixels that all carry points. Nearer than `tolerance` combined sigmas
     plus `slack` pixel footprints plus the rise among the four: confirmed (counted). In front of it by more: denied.
     Behind it: hidden there, no evidence. Depths are along the other camera's axis.
     """
-    H, W = sigma.shape
+    _H, W = sigma.shape
     h, w = other_sigma.shape
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             X = xyz[i, j, 0]
             if X != X:

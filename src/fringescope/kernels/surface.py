@@ -6,9 +6,10 @@ Arrays and scalars only. `xyz` (H, W, 3) float32 world mm with NaN holes; a lens
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fringescope.kernels.lens import to_plane
+from fringescope.threads import by_rows
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -17,8 +18,8 @@ def _unit(x, y, z):
     return x / s, y / s, z / s
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def normals(xyz, sigma, centre, radius, max_slope, jump_sigma, out):
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def normals(first, last, xyz, sigma, centre, radius, max_slope, jump_sigma, out):
     """Unit normals (H, W, 3) towards the camera at `centre` (3,): regression of xyz on pixel coordinates.
 
     The window is (2 radius + 1)^2. Neighbours whose range along the ray differs by more than `max_slope` times their
@@ -27,7 +28,7 @@ def normals(xyz, sigma, centre, radius, max_slope, jump_sigma, out):
     normal points to the camera; NaN where there is no point.
     """
     H, W = xyz.shape[0], xyz.shape[1]
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             px, py, pz = float(xyz[i, j, 0]), float(xyz[i, j, 1]), float(xyz[i, j, 2])
             if not math.isfinite(px):
@@ -87,11 +88,11 @@ def normals(xyz, sigma, centre, radius, max_slope, jump_sigma, out):
             out[i, j, 0], out[i, j, 1], out[i, j, 2] = nx / size, ny / size, nz / size
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def jumps(xyz, sigma, centre, max_slope, jump_sigma, out):
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def jumps(first, last, xyz, sigma, centre, max_slope, jump_sigma, out):
     """Whether (H, W) a point's left, right, upper or lower neighbour lies across a jump, as `normals` tells them."""
     H, W = xyz.shape[0], xyz.shape[1]
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             out[i, j] = False
             px, py, pz = float(xyz[i, j, 0]), float(xyz[i, j, 1]), float(xyz[i, j, 2])
@@ -110,10 +111,10 @@ def jumps(xyz, sigma, centre, max_slope, jump_sigma, out):
                     out[i, j] = True
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def incidence(xyz, normal, centre, out):
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def incidence(first, last, xyz, normal, centre, out):
     """Cosine (H, W) of the angle between the normal and the direction to `centre`; 0 where there is no point."""
-    for i in prange(xyz.shape[0]):
+    for i in range(first, last):
         for j in range(xyz.shape[1]):
             if not math.isfinite(xyz[i, j, 0]):
                 out[i, j] = 0.0
@@ -123,11 +124,11 @@ def incidence(xyz, normal, centre, out):
             out[i, j] = max(x * normal[i, j, 0] + y * normal[i, j, 1] + z * normal[i, j, 2], 0.0)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def spacing(xyz, out):
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def spacing(first, last, xyz, out):
     """Distance (H, W) in mm to the nearer of the right and lower neighbours; NaN where neither has a point."""
     H, W = xyz.shape[0], xyz.shape[1]
-    for i in prange(H):
+    for i in range(first, last):
         for j in range(W):
             best = np.inf
             for step in range(2):
@@ -142,10 +143,11 @@ def spacing(xyz, out):
             out[i, j] = best if best < np.inf else np.nan
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def gather(xyz, normal, sigma_n, centre, row0, row1, R, t, lens, xyz_w, normal_w, sigma_w, cosine_w, weight_w, rgb_w,
-           colour_w, agree_sigma, agree_mm, bit, shift, total, variance, facing, seen, sample):
-    """What view w says about the rays of rows `row0` to `row1` of another view; sums go into the band's arrays.
+@by_rows(lambda _xyz, _normal, _sigma_n, _centre, row0, row1, *_: row1 - row0)
+def gather(
+    first, last, xyz, normal, sigma_n, centre, row0, _row1, R, t, lens, xyz_w, normal_w, sigma_w, cosine_w, weight_w,
+           rgb_w, colour_w, agree_sigma, agree_mm, bit, shift, total, variance, facing, seen, sample):
+    """What view w says about the rays of rows `row0` to `_row1` of another view; sums go into the band's arrays.
 
     A point P is projected into view w (rotation R, translation t, `lens`) and compared with the one sample Q of the
     nearest pixel. Along the mean m of both normals, which is perpendicular to the chord PQ of any surface of second
@@ -157,7 +159,7 @@ def gather(xyz, normal, sigma_n, centre, row0, row1, R, t, lens, xyz_w, normal_w
     """
     H, W = xyz_w.shape[0], xyz_w.shape[1]
     inverse_focal = 1.0 / math.sqrt(lens[0] * lens[1])
-    for i in prange(row0, row1):
+    for i in range(row0 + first, row0 + last):
         b = i - row0
         for j in range(xyz.shape[1]):
             sample[b, j, 3] = 0.0
@@ -209,14 +211,15 @@ def gather(xyz, normal, sigma_n, centre, row0, row1, R, t, lens, xyz_w, normal_w
                 sample[b, j, 3] = cw
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def settle(xyz, normal, sigma_n, weight, centre, row0, row1, shift, total, variance, facing, xyz_out, normal_out,
+@by_rows(lambda _xyz, _normal, _sigma_n, _weight, _centre, row0, row1, *_: row1 - row0)
+def settle(
+    first, last, xyz, normal, sigma_n, weight, centre, row0, _row1, shift, total, variance, facing, xyz_out, normal_out,
            sigma_out):
-    """The weighted mean along each ray of rows `row0` to `row1`, from the sums of `gather` and the view's own sample.
+    """The weighted mean along each ray of rows `row0` to `_row1`, from the sums of `gather` and the view's own sample.
 
     `sigma_out` is one standard deviation along the ray. Nothing else sees a point: it stays as it is.
     """
-    for i in prange(row0, row1):
+    for i in range(row0 + first, row0 + last):
         b = i - row0
         for j in range(xyz.shape[1]):
             px, py, pz = float(xyz[i, j, 0]), float(xyz[i, j, 1]), float(xyz[i, j, 2])
@@ -240,15 +243,15 @@ def settle(xyz, normal, sigma_n, weight, centre, row0, row1, shift, total, varia
             sigma_out[i, j] = s / max(slope, 0.05)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def blend(samples, gloss, row0, rgb, colour_weight, out):
+@by_rows(lambda samples, *_: samples.shape[1])
+def blend(first, last, samples, gloss, row0, rgb, colour_weight, out):
     """Blended colour of a band from `samples` (V, rows, W, 4) = other views' colours and weights, and the view's own.
 
     A view that is brighter than a soft minimum over the views by more than the share `gloss` sees a highlight there
     and counts less. Where no view has a weight the view's own colour stays.
     """
-    V, rows, W = samples.shape[0], samples.shape[1], samples.shape[2]
-    for b in prange(rows):
+    V, _rows, W = samples.shape[0], samples.shape[1], samples.shape[2]
+    for b in range(first, last):
         i = row0 + b
         for j in range(W):
             own = colour_weight[i, j]
@@ -284,10 +287,10 @@ def blend(samples, gloss, row0, rgb, colour_weight, out):
             out[i, j, 0], out[i, j, 1], out[i, j, 2] = s0 / sw, s1 / sw, s2 / sw
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def plane_coordinates(xyz, R, t, out):
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def plane_coordinates(first, last, xyz, R, t, out):
     """Ideal normalised coordinates (H, W, 2) of points as the device R, t sees them; NaN where there is none."""
-    for i in prange(xyz.shape[0]):
+    for i in range(first, last):
         for j in range(xyz.shape[1]):
             px, py, pz = float(xyz[i, j, 0]), float(xyz[i, j, 1]), float(xyz[i, j, 2])
             Z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
@@ -312,11 +315,11 @@ def bin_weights(ab, weight, origin, cell, total, count):
                 count[r, c] += 1
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def owned(ab, origin, cell, owner, view, out):
+@by_rows(lambda ab, *_: ab.shape[0])
+def owned(first, last, ab, origin, cell, owner, view, out):
     """Whether (H, W) each point lies in a cell that belongs to `view`."""
     rows, cols = owner.shape
-    for i in prange(ab.shape[0]):
+    for i in range(first, last):
         for j in range(ab.shape[1]):
             out[i, j] = False
             if not math.isfinite(ab[i, j, 0]):

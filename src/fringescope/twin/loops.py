@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from fringescope.threads import by_rows
 
 
 @njit(cache=True, nogil=True)
@@ -165,10 +167,10 @@ def light_at(levels, x, y, level):
     return max(a, np.float32(0.0))
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def gather(levels, x, y, level, gain, steady, out):
+@by_rows(lambda _levels, x, *_: x.size)
+def gather(first, last, levels, x, y, level, gain, steady, out):
     """Signal of every pixel (n,): `steady` plus its gain times the light where it looks."""
-    for i in prange(x.size):
+    for i in range(first, last):
         g = gain[i]
         out[i] = steady[i] + (g * light_at(levels, x[i], y[i], level[i]) if g > 0.0 else np.float32(0.0))
 

@@ -1,0 +1,52 @@
+"""Loops over rows on all cores: compiled once as a plain loop (quick to compile), run on blocks of rows by threads."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from numba import njit
+
+WORKERS = max(1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 64))
+BLOCKS = 4 * WORKERS  #: more blocks than workers, so that none waits long for another
+SMALL = 8  #: fewer rows than this run in one piece
+
+
+@functools.cache
+def _pool(_process: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(WORKERS, thread_name_prefix="rows")
+
+
+def by_rows(count: Callable[..., int]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a kernel `f(first, last, *args)` that works on rows first..last-1 and writes nothing outside them.
+
+    The decorated kernel is called as `f(*args)`; `count(*args)` tells the number of rows. It is compiled by Numba
+    without the interpreter's lock. `f.rows` is the compiled kernel itself.
+    """
+
+    def decorate(f: Callable[..., None]) -> Callable[..., None]:
+        compiled: Any = njit(cache=True, nogil=True, error_model="numpy")(f)
+
+        @functools.wraps(f)
+        def call(*args: Any) -> None:
+            n = count(*args)
+            if n < SMALL or WORKERS == 1:
+                compiled(0, n, *args)
+                return
+            edges = [n * b // BLOCKS for b in range(BLOCKS + 1)]
+            tasks = [
+                _pool(os.getpid()).submit(compiled, a, b, *args)
+                for a, b in itertools.pairwise(edges)
+                if b > a
+            ]
+            for task in tasks:
+                task.result()
+
+        call.rows = compiled  # type: ignore[attr-defined]
+        return call
+
+    return decorate
