@@ -80,15 +80,17 @@ def demo(
     json: Json = False,
 ) -> None:
     """The simulated instrument scans a wet specimen: capture, scan, error map against the truth, rendered pictures."""
-    from fringescope import store
+    from fringescope import store, warmup
 
     s = load_settings(settings, set_)
+    compiling = warmup.in_background()
     with store.new_folder(out, marker="demo.json", force=force) as tmp, Progress() as progress:
         world = progress.run("scene", lambda: make_world(scene, preset, scale, seed, "diamond", 0, "checkerboard"))
         (tmp / "capture").mkdir()
         (tmp / "scan").mkdir()
         simulate_into(tmp / "capture", world, make_plan(world, s), s, progress)
         rig = tmp / "capture" / "truth" / "rig.json"
+        progress.run("kernels", compiling.wait)
         scan, doc = scan_into(tmp / "scan", tmp / "capture", rig, s, progress)
         found = progress.run("judging", lambda: judge(tmp, scan, world))
         words = [w for v in doc["views"] for w in v.get("words", ())]
