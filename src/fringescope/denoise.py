@@ -41,7 +41,7 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
     too.
     """
     out = decoded.reasons.copy()
-    scale = pixel_format.max_value / 255.0
+    scale = pixel_format.full_scale / 255.0
     A, B = decoded.background, decoded.modulation
     if not decoded.sets:  # Gray code alone: background and modulation are the contrast of the bits
         out[s.min_modulation * scale > B] |= np.uint16(Reason.LOW_MODULATION)

@@ -66,8 +66,8 @@ def merge(phases, sigmas):
     return float(np.angle(w @ np.exp(1j * np.asarray(phases)))), 1 / math.sqrt(w.sum())
 
 
-def votes(phase, radius, least, majority, max_slope):
-    """One round of elections: the phase with elected orders, and the change of order (-128 = no majority).
+def votes(phase, voters, radius, least, majority, max_slope):
+    """One round of elections: the phase with elected orders, and the change of order (127 = own one, -128 = none).
 
     An order more than eight away cannot be elected; votes for it only spoil the majority of the others.
     """
@@ -77,9 +77,9 @@ def votes(phase, radius, least, majority, max_slope):
         for y in range(i - radius, i + radius + 1):
             for x in range(j - radius, j + radius + 1):
                 inside = 0 <= y < phase.shape[0] and 0 <= x < phase.shape[1]
-                if not inside or (y, x) == (i, j) or not math.isfinite(phase[y, x]):
+                if not inside or (y, x) == (i, j) or not math.isfinite(voters[y, x]):
                     continue
-                difference = float(phase[y, x]) - float(phase[i, j])
+                difference = float(voters[y, x]) - float(phase[i, j])
                 if abs(wrapped(difference)) <= max_slope * max(abs(y - i), abs(x - j)):
                     ballots[round((difference - wrapped(difference)) / TWO_PI)] += 1
         total = sum(ballots.values())
@@ -90,6 +90,8 @@ def votes(phase, radius, least, majority, max_slope):
         if elected and number >= majority * total:
             changed[i, j] = elected
             out[i, j] = phase[i, j] + TWO_PI * elected
+        elif not elected and number >= majority * total:
+            changed[i, j] = 127
         elif ballots[0] < (1 - majority) * total:
             changed[i, j] = -128
     return out, changed

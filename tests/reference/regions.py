@@ -57,12 +57,13 @@ def loose_pixels(phase, sigma, reasons, limit, least):
     out = np.zeros((H, W), bool)
     ring = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
     for i, j in np.argwhere(reasons == 0):
-        links = []
+        shares = []
         for far in (1, 2):
-            around = [(i + far * y, j + far * x) for y, x in ring]
-            around = [(y, x) for y, x in around if 0 <= y < H and 0 <= x < W and reasons[y, x] == 0]
-            links.append(sum(linked(phase, sigma, limit, (i, j), n) for n in around))
-        out[i, j] = max(links) < least
+            inside = [(i + far * y, j + far * x) for y, x in ring]
+            inside = [(y, x) for y, x in inside if 0 <= y < H and 0 <= x < W]
+            links = sum(linked(phase, sigma, limit, (i, j), n) for n in inside if reasons[n] == 0)
+            shares.append(links / len(inside))
+        out[i, j] = max(shares) < least / 8
     return out
 
 

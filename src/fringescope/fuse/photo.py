@@ -60,7 +60,7 @@ def photo_from_background(background: F32, pixel_format: PixelFormat, camera: st
     It shows the specimen under the projector's light. A Bayer camera's background is a mosaic like its frames.
     """
     s = s or FuseSettings()
-    share = np.clip(np.nan_to_num(background) / pixel_format.max_value, 0.0, 1.0)
+    share = np.clip(np.nan_to_num(background) / pixel_format.full_scale, 0.0, 1.0)
     like = PixelFormat.BAYER_RG16 if pixel_format.is_bayer else PixelFormat.MONO16
     p = photo((share * 65535.0 + 0.5).astype(np.uint16), like, camera, s)
     return Photo(camera, p.rgb, np.asarray(share >= 0.99))

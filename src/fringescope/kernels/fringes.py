@@ -251,12 +251,13 @@ def unwrap(first, last, phases, sigmas, freq, bounds, unexpected, gray, gray_hal
 
 
 @by_rows(lambda phase, *_: phase.shape[0])
-def order_votes(first, last, phase, radius, least, majority, max_slope, out, changed):
+def order_votes(first, last, phase, voters, radius, least, majority, max_slope, out, changed):
     """Let the neighbours vote on each pixel's order: `out` = phase + 2 pi (elected order - own).
 
-    A neighbour votes for the order that brings this pixel nearest to it; votes count only if the wrapped difference is
-    below `max_slope` times the distance. The own order stays unless another holds `majority` of at least `least` votes.
-    `changed` gets the elected change of order (int8), or -128 where no order has the majority.
+    Each of the `voters` (a phase image, NaN = does not vote) votes for the order that brings this pixel nearest to
+    it, if the wrapped difference is below `max_slope` times the distance. The own order stays unless another, at most
+    8 away, holds `majority` of at least `least` votes. `changed` (int8) gets the elected change of order, 127 where
+    the majority confirms the own order, -128 where no order has the majority, 0 where too few voted.
     """
     H, W = phase.shape
     for i in range(first, last):
@@ -270,7 +271,7 @@ def order_votes(first, last, phase, radius, least, majority, max_slope, out, cha
             votes = 0
             for y in range(max(i - radius, 0), min(i + radius + 1, H)):
                 for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                    q = phase[y, x]
+                    q = voters[y, x]
                     if (y == i and x == j) or q != q:
                         continue
                     turns = math.floor((q - p) / TWO_PI + 0.5)
@@ -289,6 +290,8 @@ def order_votes(first, last, phase, radius, least, majority, max_slope, out, cha
             if top != 8 and counts[top] >= majority * votes:
                 out[i, j] = p + TWO_PI * (top - 8)
                 changed[i, j] = top - 8
+            elif top == 8 and counts[8] >= majority * votes:
+                changed[i, j] = 127
             elif counts[8] < (1.0 - majority) * votes:
                 changed[i, j] = -128
 

@@ -92,8 +92,8 @@ def linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
 def loose_pixels(first, last, phase, sigma, reasons, field, factor, floor, noise, least, out):
     """Pixels that stand on a jump: they continue the surface of fewer than `least` of their eight neighbours.
 
-    The eight at distance two may stand in for the next ones: on a Bayer sensor these are of the pixel's own colour, and
-    often the only ones with enough light.
+    At the image border the same share of those inside counts. The eight at distance two may stand in for the next
+    ones: on a Bayer sensor these are of the pixel's own colour, and often the only ones with enough light.
     """
     H, W = phase.shape
     for i in range(first, last):
@@ -101,19 +101,23 @@ def loose_pixels(first, last, phase, sigma, reasons, field, factor, floor, noise
             out[i, j] = False
             if reasons[i, j] != 0:
                 continue
-            most = 0
+            loose = True
             for distance in range(1, 3):
                 links = 0
+                inside = 0
                 for dy in range(-distance, distance + 1, distance):
                     for dx in range(-distance, distance + 1, distance):
                         y = i + dy
                         x = j + dx
-                        if (dy == 0 and dx == 0) or not (0 <= y < H and 0 <= x < W) or reasons[y, x] != 0:
+                        if (dy == 0 and dx == 0) or not (0 <= y < H and 0 <= x < W):
+                            continue
+                        inside += 1
+                        if reasons[y, x] != 0:
                             continue
                         if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
                             links += 1
-                most = max(most, links)
-            out[i, j] = most < least
+                loose = loose and 8 * links < least * inside
+            out[i, j] = loose
 
 
 @njit(cache=True, error_model="numpy")

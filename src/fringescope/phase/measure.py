@@ -11,7 +11,7 @@ import numpy as np
 from fringescope.errors import CaptureError
 from fringescope.kernels import fringes as k
 from fringescope.phase.noise import estimate_noise
-from fringescope.phase.sums import FringeSums, GrayBits, Measured, full_scale, intensity, rescue
+from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, rescue
 from fringescope.settings import PhaseSettings
 from fringescope.types import (
     U16,
@@ -33,7 +33,7 @@ def measure(
 
     Raises CaptureError if frames are missing, doubled or of different sizes.
     """
-    top = full_scale(plan.pixel_format)
+    top = plan.pixel_format.full_scale
     sums: dict[int, FringeSums] = {}
     bits: dict[int, GrayBits] = {}
     done: dict[int, Measured] = {}

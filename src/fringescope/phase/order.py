@@ -16,7 +16,7 @@ from fringescope.types import (
     F32,
     F64,
     U16,
-    AnyArray,
+    Bool,
     Decoded,
     Direction,
     FringeSet,
@@ -126,28 +126,35 @@ def _unwrap(
     uncertain = ~(margin >= s.order_min_margin)
     if s.order_votes > 1:
         trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)
-        absolute, changed = _elect(np.where(trusted, absolute, np.float32(np.nan)), absolute, s)
-        uncertain = np.where(changed == -128, True, uncertain & (changed == 0) & (margin < s.order_min_margin))
+        absolute, uncertain = _elect(absolute, trusted, uncertain, s)
     reasons = np.where(uncertain | ~np.isfinite(absolute), np.uint16(Reason.ORDER_UNCERTAIN), np.uint16(0))
     return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons.astype(np.uint16)
 
 
-def _elect(voters: F32, absolute: F32, s: PhaseSettings) -> tuple[F32, AnyArray]:
-    """Repair single wrong orders by the vote of the neighbours, three rounds."""
-    slope = _usual_slope(voters)
+def _elect(absolute: F32, trusted: Bool, uncertain: Bool, s: PhaseSettings) -> tuple[F32, Bool]:
+    """Repair single wrong orders by the vote of the neighbours; returns the phase, and which orders stay uncertain.
+
+    Three rounds among all trusted pixels change orders that a majority contradicts. In a last round only pixels that
+    are certain vote: they confirm, or fail to confirm, the orders of the others. A region that is uncertain as a
+    whole stays so.
+    """
+    nan = np.float32(np.nan)
+    slope = _usual_slope(np.where(trusted, absolute, nan))
     radius = s.order_votes // 2
-    total = np.zeros(absolute.shape, np.int16)
-    current = voters
+    least = max(3, (2 * radius + 1) ** 2 // 4)
+    split = np.zeros(absolute.shape, bool)
     changed = np.zeros(absolute.shape, np.int8)
     for _ in range(3):
-        nxt = np.empty_like(current)
-        k.order_votes(current, radius, max(3, (2 * radius + 1) ** 2 // 4), s.order_majority, slope, nxt, changed)
-        total += np.where(changed == -128, 0, changed)
-        current = nxt
-        if not ((changed != 0) & (changed != -128)).any():
+        out = np.empty_like(absolute)
+        k.order_votes(absolute, np.where(trusted, absolute, nan), radius, least, s.order_majority, slope, out, changed)
+        split = changed == -128
+        moved = (np.abs(changed.astype(np.int16)) <= 8) & (changed != 0)
+        absolute, uncertain = out, uncertain & ~moved
+        if not moved.any():
             break
-    repaired = np.where(np.isfinite(current), current, absolute)
-    return repaired.astype(np.float32), np.where(changed == -128, -128, np.clip(total, -127, 127))
+    sure = np.where(trusted & ~uncertain & ~split, absolute, nan)
+    k.order_votes(absolute, sure, radius, least, s.order_majority, slope, np.empty_like(absolute), changed)
+    return absolute, np.asarray((uncertain & (changed != 127)) | split)
 
 
 def _usual_slope(phase: F32) -> float:

@@ -30,11 +30,6 @@ def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
     return total
 
 
-def full_scale(pixel_format: PixelFormat) -> int:
-    """The code at which a sample of `intensity` is saturated."""
-    return pixel_format.max_value * (3 if pixel_format is PixelFormat.RGB8 else 1)
-
-
 @dataclass(frozen=True, eq=False)
 class Measured:
     """One N-step set, fitted, before the noise is known. Arrays (H, W); `variance` is NaN where no sample is left over.

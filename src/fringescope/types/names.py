@@ -41,6 +41,11 @@ class PixelFormat(Enum):
         return (1 << self.bits) - 1
 
     @property
+    def full_scale(self) -> int:
+        """The code at which a decoded sample is saturated: the sum of the channels of an RGB pixel."""
+        return self.max_value * (3 if self is PixelFormat.RGB8 else 1)
+
+    @property
     def is_bayer(self) -> bool:
         """Whether the samples lie behind an RGGB mosaic."""
         return self.value.startswith("Bayer")
