@@ -269,6 +269,8 @@ def patterns(
     out: Out,
     plan: Annotated[str, typer.Option(help="paper (Table I), planned, horizontal or calibration.")] = "paper",
     pixel_format_: Annotated[str, typer.Option("--pixel-format", help="Of the cameras.")] = "BayerRG8",
+    background: Annotated[float, typer.Option(help="A expected on the specimen, 8-bit codes.", min=0)] = 70,
+    modulation: Annotated[float, typer.Option(help="B expected on the specimen, 8-bit codes.", min=0.1)] = 50,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -277,7 +279,7 @@ def patterns(
     """The images to project for a rig, as the device needs them, with the plan that they follow."""
     from fringescope import patterns as p
     from fringescope import store
-    from fringescope.types import PixelFormat
+    from fringescope.types import NoiseModel, PixelFormat
 
     s = load_settings(settings, set_)
     r = store.read_rig(rig)
@@ -296,12 +298,24 @@ def patterns(
         planned = plans[plan]()
         total = sum(len(v.keys) for v in planned.views)
         doc = store.put_patterns(tmp, planned, progress.track(p.plan_images(planned, s.patterns), "patterns", total))
+    lines, expected = [f"{out}: {total} images for {len(planned.views)} views"], []
+    if plan != "calibration":  # what a grey spot in the middle of the volume will give, before anything is captured
+        codes = fmt.full_scale / 255
+        noise = NoiseModel(0.25 * codes**2, 0.016 * codes)
+        for view in planned.views:
+            a = p.predict(r, view, noise, modulation * codes, background * codes)
+            expected.append({
+                "camera": a.camera, "sigma_um": 1000 * float(a.depth_sigma_mm[0]), "wrong_orders": a.order_error,
+                "gain_over_horizontal": float(a.gain_over_horizontal[0]),
+            })  # fmt: skip
+            wrong = f"{100 * a.order_error:.2g} %" if a.order_error > 1e-6 else "below 0.0001 %"
+            lines.append(
+                f"{a.camera}: sigma {1000 * a.depth_sigma_mm[0]:.1f} um, wrong orders {wrong}, "
+                f"{a.gain_over_horizontal[0]:.2f} times better than horizontal fringes"
+            )
     warnings = [] if plan == "calibration" else list(p.validate(planned, r, s.patterns))
-    emit(
-        {"patterns": str(out), "warnings": warnings, **doc},
-        json,
-        [f"{out}: {total} images for {len(planned.views)} views", *warnings],
-    )
+    told = {"patterns": str(out), "expected": expected, "warnings": warnings, **doc}
+    emit(told, json, [*lines, *warnings])
 
 
 @app.command()

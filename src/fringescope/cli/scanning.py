@@ -68,6 +68,7 @@ def scan_into(
             rig_hash=store.hash_rig(rig),
             write_ply=export.write_ply,
             write_glb=export.write_glb,
+            write_preview=export.write_preview,
             times_s=progress.times_s,
             grids=grids,
         ),
@@ -84,6 +85,8 @@ def scan_summary(doc: dict[str, Any], out: Path) -> list[str]:
     """A scan in lines for people: what there is, and what each view lost and why."""
     surface = doc["surface"]
     lines = [f"{out}: {doc['cloud']['points']} points" + (f", {surface['triangles']} triangles" if surface else "")]
+    if isinstance(why := doc["figures"].get("surface"), str):
+        lines.append(why)
     for v in doc["views"]:
         lines += list(v.get("words", ()))
     return lines
