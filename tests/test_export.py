@@ -1,5 +1,6 @@
 """What we write is read back by others' rules: PLY by our reader and by hand, GLB by Khronos' validator."""
 
+import dataclasses
 import io
 import json
 import shutil
@@ -241,6 +242,21 @@ def test_khronos_validator_has_no_word_to_say(validator, tmp_path, n):
     assert report["issues"]["numErrors"] == 0, report["issues"]["messages"][:3]
     assert report["issues"]["numWarnings"] == 0, report["issues"]["messages"][:3]
     assert report["info"]["totalTriangleCount"] == 2 * (n - 1) ** 2
+
+
+def test_a_preview_keeps_within_its_bytes_and_the_validator_is_content(validator, tmp_path):
+    s = surface(60)
+    noise = np.random.default_rng(0).integers(0, 255, (400, 600, 3), np.uint8)
+    s = dataclasses.replace(s, parts=tuple(dataclasses.replace(p, texture=noise) for p in s.parts))
+    sizes = []
+    for most in (10_000_000, 300_000, 170_000):
+        export.write_preview(s, tmp_path / "p.glb", {"scan": "sha256:0"}, most)
+        sizes.append((tmp_path / "p.glb").stat().st_size)
+        assert sizes[-1] <= most
+        report = validator(tmp_path / "p.glb")
+        assert report["issues"]["numErrors"] == 0, report["issues"]["messages"][:3]
+        assert report["info"]["totalTriangleCount"] == s.n_faces
+    assert sizes[0] > sizes[1] > sizes[2] > 75_000
 
 
 def test_khronos_validator_does_find_errors(validator, tmp_path):

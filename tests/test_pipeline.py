@@ -5,7 +5,7 @@ import pytest
 
 from fringescope import denoise, phase, pipeline, triangulate
 from fringescope.errors import CaptureError, DecodeError, EmptyResultError, RigError
-from fringescope.settings import Settings
+from fringescope.settings import MeshSettings, Settings
 from fringescope.types import PixelFormat, Reason, Rig, ViewInput, Volume
 from tests import core_scenes as core
 from tests import fuse_scenes as scenes
@@ -161,6 +161,15 @@ def test_one_black_view_does_not_stop_the_others(rig, views):
     assert made.verdicts[0].points == 0
     assert made.figures["views"]["camera1"]["sigma_median_mm"] is None
     assert set(made.cloud.view) == {1, 2}
+
+
+def test_points_without_a_triangle_are_still_a_scan(rig, views):
+    s = Settings(mesh=MeshSettings(min_area_mm2=1e9))
+    made = pipeline.scan(views, rig, s)
+    assert len(made.cloud) > 1000
+    assert made.surface is None
+    assert made.preview is None
+    assert made.figures["surface"].startswith("no surface: ")
 
 
 def test_blown_views_give_one_line_and_no_scan(rig, views):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -31,6 +32,8 @@ from fringescope.types import (
     Reason,
     Role,
     Scan,
+    Surface,
+    SurfacePart,
     ViewInput,
     ViewPlan,
     ViewVerdict,
@@ -324,6 +327,26 @@ def write_a_scan(folder: Path, **more: Any) -> dict[str, Any]:
         write_glb=glb,
         **more,
     )
+
+
+def test_surface_and_preview_are_counted_and_listed(tmp_path: Path) -> None:
+    def write(s: Surface, path: Path, extras: Any) -> None:
+        path.write_text(f"{s.n_faces} {extras['scan']}")
+
+    part = SurfacePart(0, np.arange(3, dtype=np.uint32), np.zeros((3, 2), np.float32), np.zeros((2, 3), np.uint32),
+                       np.zeros((4, 4, 3), np.uint8))
+    fine = Surface(np.zeros((3, 3), np.float32), np.zeros((3, 3), np.float32), (part, part))
+    coarse = Surface(fine.vertices, fine.normals, (part,))
+    doc = store.write_scan(
+        tmp_path / "s", dataclasses.replace(a_scan(), surface=fine, preview=coarse), settings={},
+        capture_hash="sha256:1", rig_hash="sha256:2", write_ply=lambda _, path: path.write_bytes(b"ply"),
+        write_glb=write, write_preview=write,
+    )  # fmt: skip
+    assert (tmp_path / "s" / "surface.glb").read_text() == f"4 {doc['hash']}"
+    assert (tmp_path / "s" / "preview.glb").read_text() == f"2 {doc['hash']}"
+    assert {"surface.glb", "preview.glb"} <= set(doc["files"])
+    assert doc["preview"] == {"vertices": 3, "triangles": 2}
+    assert doc["surface"]["triangles"] == 4
 
 
 @pytest.mark.parametrize("grids", [True, False])

@@ -19,10 +19,6 @@ if [ ! -x "$venv/bin/pip" ]; then
   fi
   "$python" -m venv "$venv"
 fi
-if ! command -v c++ >/dev/null && ! command -v g++ >/dev/null; then
-  echo "no C++ compiler here; pip needs one for meshoptimizer (Debian, Ubuntu: apt-get install g++)" >&2
-  exit 1
-fi
 echo "installing the pinned packages into $venv (about a minute the first time)"
 "$venv/bin/pip" install --quiet --disable-pip-version-check --require-hashes -r constraints/dev.txt
 "$venv/bin/pip" install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .

@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
-# Installs the system packages that the project's own tasks use, on Debian and Ubuntu. To install `fringescope` alone,
-# Python, pip and the C++ compiler are enough.
+# Installs the system packages that the project's own tasks use, on Debian and Ubuntu. To install `fringescope` alone, Python
+# and pip are enough.
 #
-#   g++              meshoptimizer is published as source, and pip compiles it (seconds)
 #   python3-venv     make: the environment in .venv
 #   make, git        the tasks; tests that look at the tracked files
 #   nodejs, npm      Khronos' glTF validator, which judges surface.glb; checks of the viewer page's script
@@ -12,14 +11,13 @@
 set -uo pipefail
 
 if ! command -v apt-get >/dev/null; then
-  echo "system packages: no apt-get here; install by hand what you miss: python3-venv make git g++ nodejs npm chromium"
+  echo "system packages: no apt-get here; install by hand what you miss: python3-venv make git nodejs npm chromium"
   exit 0
 fi
 wanted=()
 command -v make >/dev/null || wanted+=(make)
 command -v git >/dev/null || wanted+=(git)
 python3 -c 'import ensurepip, venv' 2>/dev/null || wanted+=(python3-venv)
-command -v c++ >/dev/null || wanted+=(g++)
 command -v node >/dev/null || wanted+=(nodejs)
 command -v npm >/dev/null || wanted+=(npm)
 command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || wanted+=(chromium)

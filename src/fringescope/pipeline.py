@@ -67,7 +67,8 @@ def scan(
 ) -> Scan:
     """Fringe images of all views to one clean, coloured surface.
 
-    `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Raises
+    `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Where the
+    points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. Raises
     EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
@@ -103,7 +104,10 @@ def scan(
     if surface:
         tell("meshing", 0.85)
         start = perf_counter()
-        levels = fuse.surface(fused, rig, s.mesh)
+        try:
+            levels = fuse.surface(fused, rig, s.mesh)
+        except EmptyResultError as e:  # points too far apart for a triangle are still points
+            figures["surface"] = str(e)
         times["mesh"] = perf_counter() - start
     tell("done", 1.0)
     figures["times_s"] = times

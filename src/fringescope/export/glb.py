@@ -6,6 +6,7 @@ import json
 import math
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -52,13 +53,15 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def glb_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, quality: int = 90, lit: bool = False) -> bytes:
+def glb_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, quality: int = 90, lit: bool = False,
+              lean: bool = False) -> bytes:
     """A surface as the bytes of a GLB file.
 
     Vertices stay world mm, float32; one root node scales by 0.001 and turns z-up into glTF's y-up. `extras` (scan hash
     and so on) go beside the units into `asset.extras`. Pictures are JPEG of `quality`, or PNG above 100. Materials are
     unlit (KHR_materials_unlit, with the core material as what other viewers show), so that colours appear as the
-    cameras saw them; `lit` leaves the light to the viewer. Raises OutputError if a picture cannot be encoded.
+    cameras saw them; `lit` leaves the light to the viewer. `lean` writes 16 bytes a vertex instead of 32: no normals,
+    texture coordinates in 16 bits, both core glTF. Raises OutputError if a picture cannot be encoded.
     """
     b = _Buffer()
     primitives, materials, textures, images = (list[dict[str, Any]]() for _ in range(4))
@@ -66,17 +69,21 @@ def glb_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, quality
         if not len(part.faces):
             continue
         xyz = np.ascontiguousarray(surface.vertices[part.vertex_index], dtype="<f4")
-        normals = surface.normals[part.vertex_index].astype(np.float64)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         small = len(xyz) < 65535
         indices = part.faces.astype("<u2" if small else "<u4").reshape(-1)
         picture, mime = encode_picture(part.texture, quality)
+        attributes = {"POSITION": b.accessor(xyz, "VEC3", _FLOAT, _ARRAY_BUFFER, bounds=True)}
+        if lean:
+            uv = np.rint(np.clip(part.uv, 0, 1) * 65535).astype("<u2")
+            attributes["TEXCOORD_0"] = b.accessor(uv, "VEC2", _UINT16, _ARRAY_BUFFER)
+            b.accessors[-1]["normalized"] = True
+        else:
+            normals = surface.normals[part.vertex_index].astype(np.float64)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+            attributes["NORMAL"] = b.accessor(normals.astype("<f4"), "VEC3", _FLOAT, _ARRAY_BUFFER)
+            attributes["TEXCOORD_0"] = b.accessor(part.uv.astype("<f4"), "VEC2", _FLOAT, _ARRAY_BUFFER)
         primitives.append({
-            "attributes": {
-                "POSITION": b.accessor(xyz, "VEC3", _FLOAT, _ARRAY_BUFFER, bounds=True),
-                "NORMAL": b.accessor(normals.astype("<f4"), "VEC3", _FLOAT, _ARRAY_BUFFER),
-                "TEXCOORD_0": b.accessor(part.uv.astype("<f4"), "VEC2", _FLOAT, _ARRAY_BUFFER),
-            },
+            "attributes": attributes,
             "indices": b.accessor(indices, "SCALAR", _UINT16 if small else _UINT32, _ELEMENT_BUFFER),
             "material": len(materials),
             "mode": 4,
@@ -121,5 +128,35 @@ def write_glb(surface: Surface, target: Target, extras: Mapping[str, Any] | None
               lit: bool = False) -> None:
     """Write `glb_bytes` to a path or a binary file object."""
     data = glb_bytes(surface, extras, quality, lit)
+    with opened(target) as f:
+        f.write(data)
+
+
+def preview_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, most: int = 1_000_000) -> bytes:
+    """A lean GLB of at most `most` bytes: pictures get smaller, then coarser, until it fits.
+
+    Scales go down by the square root of 2 from the cameras' sampling to 1/8 of it, at JPEG quality 85, 75 and 60 each.
+    A mesh that is too large in itself comes with the smallest pictures, and is larger than `most`.
+    """
+    data = b""
+    for halves in range(7):
+        scale = 0.5 ** (halves / 2)
+        parts = []
+        for part in surface.parts:
+            h, w = part.texture.shape[:2]
+            size = (max(1, round(w * scale)), max(1, round(h * scale)))
+            picture = part.texture if halves == 0 else cv2.resize(part.texture, size, interpolation=cv2.INTER_AREA)
+            parts.append(replace(part, texture=np.asarray(picture, np.uint8)))
+        for quality in (85, 75, 60):
+            data = glb_bytes(replace(surface, parts=tuple(parts)), extras, quality, lean=True)
+            if len(data) <= most:
+                return data
+    return data
+
+
+def write_preview(surface: Surface, target: Target, extras: Mapping[str, Any] | None = None,
+                  most: int = 1_000_000) -> None:
+    """Write `preview_bytes` to a path or a binary file object."""
+    data = preview_bytes(surface, extras, most)
     with opened(target) as f:
         f.write(data)

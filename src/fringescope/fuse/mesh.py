@@ -5,21 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import meshoptimizer
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import QhullError
 
 from fringescope import geometry
 from fringescope.errors import EmptyResultError
+from fringescope.fuse.levels import Sheet, removable, simplify, triangulations
 from fringescope.fuse.points import Fused
 from fringescope.kernels import mesh as k
 from fringescope.settings import MeshSettings
 from fringescope.types import F32, U8, AnyArray, Bool, Rig, Surface, SurfacePart
 
-_ANY_ERROR = 1e6  # mm; the number of triangles decides, so that a level has the size that a browser takes
 _MARGIN = 2  # pixels kept around the used part of a picture, so that interpolation has neighbours
 
 
@@ -34,6 +31,7 @@ class _Points:
     owner: U8
     seen: U8
     pixel: F32  #: (n, 2) of the owning camera
+    stride: int  #: of pixels, along rows and columns
 
 
 def _points(fused: Fused, rig: Rig, s: MeshSettings) -> _Points:
@@ -53,72 +51,82 @@ def _points(fused: Fused, rig: Rig, s: MeshSettings) -> _Points:
         reach = stride * pixel_mm / np.maximum(cosine, 0.2)
         parts.append((xyz, normal, grid.sigma[rows, cols], reach.astype(np.float32), np.full(len(rows), i, np.uint8),
                       fused.seen[i][rows, cols], np.stack([cols, rows], axis=1).astype(np.float32)))
-    return _Points(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    xyz, normal, sigma, reach, owner, seen, pixel = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return _Points(xyz, normal, sigma, reach, owner, seen, pixel, stride)
 
 
 def _crumbs(faces: NDArray[np.int64], xyz: F32, min_area: float) -> Bool:
     """Triangles of connected pieces with at least the area `min_area`, mm^2."""
-    if not len(faces):
-        return np.zeros(0, np.bool_)
-    n = len(xyz)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(n, n))
-    label = connected_components(graph, directed=False)[1][faces[:, 0]]
     area = np.empty(len(faces), np.float64)
     k.areas(faces, xyz, area)
-    total = np.bincount(label, weights=area)
-    return np.asarray(total[label] >= min_area)
+    label = k.pieces(faces, len(xyz))
+    return np.asarray(np.bincount(label, weights=area)[label] >= min_area)
 
 
-def _two_sided(faces: NDArray[np.int64], xyz: F32) -> NDArray[np.int64]:
-    """Drop the smallest triangles at edges that more than two of them share, which a simplification may leave."""
-    while len(faces):
-        ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        key = ends[:, 0] * len(xyz) + ends[:, 1]
-        _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
-        crowded = np.flatnonzero(count[edge] > 2)
-        if not len(crowded):
+def _one_fan(faces: NDArray[np.int64], n: int) -> Bool:
+    """Triangles that may stay so that no vertex joins two fans: then the surface is a manifold with border."""
+    stay = np.ones(len(faces), np.bool_)
+    while stay.any():
+        some = faces[stay]
+        start, around = k.incident(some, n)
+        drop = np.zeros(len(some), np.bool_)
+        if k.bow_ties(some, start, around, np.empty(len(around), np.int64), drop) == 0:
             break
-        area = np.empty(len(faces), np.float64)
-        k.areas(faces, xyz, area)
-        face = crowded % len(faces)
-        order = np.lexsort((area[face], edge[crowded]))
-        first = np.unique(edge[crowded][order], return_index=True)[1]
-        faces = np.delete(faces, face[order[first]], axis=0)
-    return faces
+        stay[np.flatnonzero(stay)[drop]] = False
+    return stay
 
 
-def _one_fan(faces: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Drop triangles until no vertex joins two fans, so that the surface is a manifold with border."""
-    while len(faces):
-        corner = faces.ravel()
-        order = np.argsort(corner, kind="stable")
-        start = np.searchsorted(corner[order], np.arange(n + 1))
-        drop = np.zeros(len(faces), np.bool_)
-        if k.bow_ties(faces, start, order // 3, np.empty(len(order), np.int64), drop) == 0:
-            break
-        faces = faces[~drop]
-    return faces
+def _sheet(p: _Points, rig: Rig, s: MeshSettings) -> Sheet:
+    """Triangles by Delaunay over the projector's field, in which the surface is single-valued.
 
-
-def _triangulate(p: _Points, rig: Rig, s: MeshSettings) -> NDArray[np.int64]:
-    """Triangles (m, 3) by Delaunay over the projector's field, in which the surface is single-valued.
-
-    Triangles across a hole, a shadow or a jump go, then crumbs. Counter-clockwise as the projector sees them.
+    Triangles across a hole, a shadow or a jump are not on the surface, nor are crumbs.
     """
     q = geometry.transform(rig.projector.pose, p.xyz)
     ab = q[:, :2] / q[:, 2:]
     ab = (ab - ab.mean(axis=0)) * float(np.median(q[:, 2]))
+    empty = np.zeros((0, 3), np.int32)
     if len(ab) < 3:
-        return np.zeros((0, 3), np.int64)
+        return Sheet(ab, p.xyz, p.normal, empty, empty, np.zeros(0, np.bool_))
     try:
-        faces = Delaunay(ab).simplices.astype(np.int64)
+        (d,) = triangulations([ab])
     except QhullError:  # all on one line
-        return np.zeros((0, 3), np.int64)
-    good = np.empty(len(faces), np.bool_)
-    k.on_surface(faces, p.xyz, p.normal, p.sigma, p.reach, s.max_edge, s.jump_slope, s.jump_sigma, good)
-    faces = faces[good]
-    return _outward(_one_fan(faces[_crumbs(faces, p.xyz, s.min_area_mm2)], len(p.xyz)), p.xyz, rig)
+        return Sheet(ab, p.xyz, p.normal, empty, empty, np.zeros(0, np.bool_))
+    on = np.empty(len(d.simplices), np.bool_)
+    k.on_surface(d.simplices, p.xyz, p.normal, p.sigma, p.reach, s.max_edge, s.jump_slope, s.jump_sigma, on)
+    on[on] = _crumbs(d.simplices[on].astype(np.int64), p.xyz, s.min_area_mm2)
+    on[on] = _one_fan(d.simplices[on].astype(np.int64), len(p.xyz))
+    return Sheet(ab, p.xyz, p.normal, d.simplices, d.neighbors, on)
+
+
+def _thinned(p: _Points, stride: int) -> tuple[_Points, NDArray[np.int64]]:
+    """Every `stride`-th of the points along rows and columns, and which they are."""
+    at = np.flatnonzero((p.pixel % (stride * p.stride) == 0).all(axis=1))
+    return _Points(p.xyz[at], p.normal[at], p.sigma[at], p.reach[at] * np.float32(stride), p.owner[at], p.seen[at],
+                   p.pixel[at], p.stride * stride), at
+
+
+def _levels(p: _Points, sheet: Sheet, rig: Rig, s: MeshSettings) -> list[NDArray[np.int64]]:
+    """Triangles of each level, finest first.
+
+    Where the border alone takes most of a level's triangles, as on ragged surfaces, the level starts from fewer points.
+    """
+    wanted = (s.triangles, s.preview_triangles)
+    plain = [t for t in wanted if removable(sheet, t) and len(sheet.faces) > t]
+    simple = dict(zip(plain, simplify(sheet, plain), strict=True)) if plain else {}
+    out = []
+    for triangles in wanted:
+        faces = simple.get(triangles, sheet.faces)
+        stride = 1
+        while len(faces) > triangles:
+            stride *= 2
+            some, at = _thinned(p, stride)
+            coarse = _sheet(some, rig, s)
+            small = coarse.faces
+            if len(small) > triangles and removable(coarse, triangles):
+                (small,) = simplify(coarse, [triangles])
+            faces = at[small]
+        out.append(_outward(faces[_one_fan(faces, len(p.xyz))], p.xyz, rig))
+    return out
 
 
 def _outward(faces: NDArray[np.int64], xyz: F32, rig: Rig) -> NDArray[np.int64]:
@@ -128,22 +136,6 @@ def _outward(faces: NDArray[np.int64], xyz: F32, rig: Rig) -> NDArray[np.int64]:
     faces = faces.copy()
     faces[side < 0] = faces[side < 0][:, [0, 2, 1]]
     return np.asarray(faces[side != 0])
-
-
-def _simplify(faces: NDArray[np.int64], xyz: F32, triangles: int) -> NDArray[np.int64]:
-    """At most `triangles` triangles over a subset of the vertices, with the least change of shape; borders last."""
-    if len(faces) <= triangles:
-        return faces
-    used, local = np.unique(faces, return_inverse=True)
-    index = local.reshape(-1).astype(np.uint32)
-    out = np.zeros_like(index)
-    vertices, count = np.ascontiguousarray(xyz[used]), 0
-    for border in (meshoptimizer.SIMPLIFY_LOCK_BORDER, 0):  # a ragged surface is mostly border
-        count = meshoptimizer.simplify(out, index, vertices, target_index_count=3 * triangles, target_error=_ANY_ERROR,
-                                       options=border | meshoptimizer.SIMPLIFY_ERROR_ABSOLUTE)
-        if count <= 3.03 * triangles:
-            break
-    return used[out[:count].reshape(-1, 3)].astype(np.int64)
 
 
 def _part_views(faces: NDArray[np.int64], p: _Points, views: int) -> U8:
@@ -190,12 +182,9 @@ def surface(fused: Fused, rig: Rig, s: MeshSettings | None = None) -> tuple[Surf
     """
     s = s or MeshSettings()
     p = _points(fused, rig, s)
-    faces = _triangulate(p, rig, s)
-    if not len(faces):
+    sheet = _sheet(p, rig, s)
+    levels = _levels(p, sheet, rig, s) if sheet.on.any() else []
+    if not levels or not all(len(faces) for faces in levels):
         raise EmptyResultError(f"no surface: {len(p.xyz)} points, none with neighbours near enough for a triangle; "
                                "look at the reasons per view, or raise mesh.max_edge")
-    levels = []
-    for triangles in (s.triangles, s.preview_triangles):
-        faces = _one_fan(_two_sided(_simplify(faces, p.xyz, triangles), p.xyz), len(p.xyz))
-        levels.append(_assemble(faces, p, fused, rig))
-    return tuple(levels)
+    return tuple(_assemble(faces, p, fused, rig) for faces in levels)

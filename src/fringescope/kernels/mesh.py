@@ -112,7 +112,7 @@ def facing(first, last, faces, xyz, centre, out):
 
 @njit(cache=True)
 def incident(faces, n):
-    """Triangles around each of `n` vertices: (start (n + 1,), around (3 m,)), those of v at start[v] to start[v + 1]."""
+    """Triangles around each of `n` vertices: start (n + 1,), around (3 m,); those of v in start[v]..start[v + 1]."""
     start = np.zeros(n + 1, np.int64)
     for f in range(faces.shape[0]):
         for c in range(3):
@@ -131,7 +131,7 @@ def incident(faces, n):
 
 @njit(cache=True)
 def pieces(faces, n):
-    """Label (m,) of the connected piece of each triangle: the smallest of its vertices. Union-find over `n` vertices."""
+    """Label (m,) of the connected piece of each triangle: the smallest of its vertices, of `n`. Union-find."""
     parent = np.arange(n)
     for f in range(faces.shape[0]):
         for c in range(2):
@@ -152,53 +152,53 @@ def pieces(faces, n):
     return label
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def ring_mean(faces, start, around, value, out):
+@by_rows(lambda *args: args[-1].shape[0])
+def ring_mean(first, last, faces, start, around, value, out):
     """Mean (n,) of `value` (n,) over the corners of the triangles around each vertex; its own value without any."""
-    for v in prange(out.shape[0]):
+    for v in range(first, last):
         total, count = 0.0, 0
         for k in range(start[v], start[v + 1]):
             for c in range(3):
                 total += value[faces[around[k], c]]
                 count += 1
-        out[v] = total / count if count > 0 else np.float64(value[v])
+        if count == 0:
+            total, count = total + value[v], 1
+        out[v] = total / count
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def locate(points, corners, simplices, neighbours, out):
+@by_rows(lambda points, *_: points.shape[0])
+def locate(first, last, points, corners, simplices, neighbours, out):
     """The Delaunay triangle (q,) that holds each of `points` (q, 2), -1 for points outside.
 
     Walks from triangle to triangle across the edge that has the point on its far side; `simplices` (m, 3) into
-    `corners` (n, 2) are counter-clockwise, neighbours[t, k] lies opposite corner k of t, -1 beyond the hull. Points that
-    follow each other should lie near each other.
+    `corners` (n, 2) are counter-clockwise, neighbours[t, k] lies opposite corner k of t, -1 beyond the hull. Points
+    that follow each other should lie near each other.
     """
-    chunk = 2048
-    for b in prange((points.shape[0] + chunk - 1) // chunk):
-        t = 0
-        for i in range(b * chunk, min((b + 1) * chunk, points.shape[0])):
-            x, y = points[i, 0], points[i, 1]
-            found = -1
-            for _ in range(simplices.shape[0]):
-                step, worst = -1, 0.0
-                for k in range(3):
-                    p, q = simplices[t, (k + 1) % 3], simplices[t, (k + 2) % 3]
-                    ex, ey = corners[q, 0] - corners[p, 0], corners[q, 1] - corners[p, 1]
-                    side = ex * (y - corners[p, 1]) - ey * (x - corners[p, 0])
-                    if side < worst - 1e-12 * (ex * ex + ey * ey):
-                        step, worst = k, side
-                if step < 0:
-                    found = t
-                    break
-                if neighbours[t, step] < 0:
-                    break
-                t = neighbours[t, step]
-            out[i] = found
+    t = 0
+    for i in range(first, last):
+        x, y = points[i, 0], points[i, 1]
+        found = -1
+        for _ in range(simplices.shape[0]):
+            step, worst = -1, 0.0
+            for c in range(3):
+                p, q = simplices[t, (c + 1) % 3], simplices[t, (c + 2) % 3]
+                ex, ey = corners[q, 0] - corners[p, 0], corners[q, 1] - corners[p, 1]
+                side = ex * (y - corners[p, 1]) - ey * (x - corners[p, 0])
+                if side < worst - 1e-12 * (ex * ex + ey * ey):
+                    step, worst = c, side
+            if step < 0:
+                found = t
+                break
+            if neighbours[t, step] < 0:
+                break
+            t = neighbours[t, step]
+        out[i] = found
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def deviations(xyz, triangle, faces, out):
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def deviations(first, last, xyz, triangle, faces, out):
     """Signed distance (n,) of each point from the plane of its `triangle` (n,) of `faces`, mm; 0 where that is -1."""
-    for i in prange(out.shape[0]):
+    for i in range(first, last):
         f = triangle[i]
         out[i] = 0.0
         if f < 0:

@@ -89,6 +89,7 @@ def put_scan(
     rig_hash: str,
     write_ply: WritePly,
     write_glb: WriteGlb,
+    write_preview: WriteGlb | None = None,
     times_s: Mapping[str, float] | None = None,
     grids: bool = False,
     extra: Mapping[str, Any] | None = None,
@@ -96,8 +97,9 @@ def put_scan(
     """Writes a scan into an existing folder and returns its scan.json.
 
     `scan.all_points`, where there is one, takes the place of the fused cloud in cloud.ply. `grids` writes the organised
-    grids as TIFF and PNG, else as .npy. `extra` adds keys to scan.json. "hash" identifies the scan: sha256
-    over the hashes of capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
+    grids as TIFF and PNG, else as .npy. `write_preview` writes the small level, preview.glb. `extra` adds
+    keys to scan.json. "hash" identifies the scan: sha256 over the hashes of capture and rig, settings, program version
+    and cloud.ply; the GLB carries it in `asset.extras`.
     """
     cloud = scan.cloud if scan.all_points is None else scan.all_points
     write_ply(cloud, folder / "cloud.ply")
@@ -109,9 +111,12 @@ def put_scan(
         "cloud": _sha256(folder / "cloud.ply"),
     }
     hash_ = files.canonical_hash(identity)
+    extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
     if scan.surface is not None:
-        extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
         write_glb(scan.surface, folder / "surface.glb", extras)
+    preview = scan.preview if write_preview else None
+    if preview is not None and write_preview is not None:
+        write_preview(preview, folder / "preview.glb", extras)
     for g in scan.grids:
         _put_grid(folder / g.camera, g, grids)
     digests = {str(p.relative_to(folder).as_posix()): _sha256(p) for p in sorted(folder.rglob("*")) if p.is_file()}
@@ -133,6 +138,9 @@ def put_scan(
             "triangles": scan.surface.n_faces,
             "textures": [list(p.texture.shape[1::-1]) for p in scan.surface.parts],
         },
+        "preview": None
+        if preview is None
+        else {"vertices": len(preview.vertices), "triangles": preview.n_faces},
         "grids": "tif" if grids else "npy",
         "views": [
             {"view": g.view, "camera": g.camera, "size": list(g.reasons.shape[::-1]), **verdicts.get(g.camera, {})}
