@@ -78,7 +78,7 @@ def test_every_specimen(name: str, seed: int) -> None:
 
 
 @pytest.mark.verify
-@pytest.mark.parametrize("seed", range(20, 26))
+@pytest.mark.parametrize("seed", range(20, 23))
 @pytest.mark.parametrize("preset", ["paper", "single", "pair", "five"])
 @pytest.mark.parametrize("name", ["sphere", "steps", "tissue-domed", "tissue-folded", "tissue-thin"])
 def test_all_scenes_all_presets(name: str, preset: str, seed: int) -> None:
