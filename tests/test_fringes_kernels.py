@@ -64,7 +64,8 @@ def test_wrap_is_the_least_squares_sinusoid_of_what_is_not_saturated(steps, bits
         if keep.sum() == 3:
             assert math.isnan(m.variance[i, j])
         else:
-            rounding = 1.2e-7 * steps * top**2 if top < 1024 else 1e-3 * want_variance + 1e-15 * steps * top**2  # of sums
+            # what float32 does to the sums of squares, or float64 to those of deep pixels
+            rounding = 1.2e-7 * steps * top**2 if top < 1024 else 1e-3 * want_variance + 1e-15 * steps * top**2
             assert m.variance[i, j] == pytest.approx(want_variance, rel=2e-3, abs=gain * rounding)
 
 
