@@ -78,6 +78,7 @@ def _option(parameter: Any) -> tuple[str, str]:
 def commands_page() -> str:
     """Every verb of the command line with its arguments and options."""
     import typer.main
+
     from fringescope.cli import app
 
     root = typer.main.get_command(app)
