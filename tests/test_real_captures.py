@@ -65,8 +65,6 @@ def test_sixteen_bit_stack_decodes(shared: Path, tmp_path: Path) -> None:
     from fringescope.cli import run
 
     stack = shared / "data" / "stack-16bit" / "ex_stack.tif"
-    with pytest.raises(SystemExit) as status:
-        run(["decode", str(stack), "--steps", "3", "--axis", "Z", "--out", str(tmp_path / "out")])
-    assert status.value.code == 0
+    assert run(["decode", str(stack), "--steps", "3", "--axis", "Z", "--out", str(tmp_path / "out")]) == 0
     files = {p.name for p in (tmp_path / "out").rglob("*.tif")}
     assert {"phase_0.tif", "modulation.tif", "background.tif", "u.tif", "v.tif"} <= files

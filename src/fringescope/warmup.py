@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -47,7 +48,15 @@ def compile_kernels() -> int:
     return len(scan.cloud)
 
 
-def in_background() -> subprocess.Popen[bytes]:
-    """Starts `compile_kernels` in a process of its own; wait for it before the kernels are needed here."""
+@contextmanager
+def in_background() -> Iterator[subprocess.Popen[bytes]]:
+    """Runs `compile_kernels` in a process of its own; wait for it before the kernels are needed here.
+
+    The process ends with the context at the latest.
+    """
     command = [sys.executable, "-c", "from fringescope import warmup; warmup.compile_kernels()"]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()

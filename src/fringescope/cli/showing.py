@@ -83,8 +83,11 @@ def demo(
     from fringescope import store, warmup
 
     s = load_settings(settings, set_)
-    compiling = warmup.in_background()
-    with store.new_folder(out, marker="demo.json", force=force) as tmp, Progress() as progress:
+    with (
+        store.new_folder(out, marker="demo.json", force=force) as tmp,
+        warmup.in_background() as compiling,
+        Progress() as progress,
+    ):
         world = progress.run("scene", lambda: make_world(scene, preset, scale, seed, "diamond", 0, "checkerboard"))
         (tmp / "capture").mkdir()
         (tmp / "scan").mkdir()
