@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -64,6 +66,11 @@ def judge(folder: Path, scan: Scan, world: World) -> dict[str, Any]:
     }
 
 
+def _has_screen() -> bool:
+    """Whether a browser could open a window here."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Where everything goes: a new or empty folder.")] = Path(
@@ -120,5 +127,5 @@ def demo(
     page = out / "scan" / "view.html"
     lines += [f"look at it: {page}"] if page.exists() else []
     emit({"demo": str(out), **told}, json, lines)
-    if not headless and page.exists():
+    if not headless and page.exists() and _has_screen():
         typer.launch(page.resolve().as_uri())
