@@ -321,7 +321,7 @@ def lossy(**shares):
     ("SATURATED", 0.06, "halve the exposure"), ("REVERSED", 0.02, "dry the surface"),
     ("VIEWS_DISAGREE", 0.05, "calibrate anew"), ("OUT_OF_VOLUME", 0.2, "measuring volume"),
     ("ORDER_UNCERTAIN", 0.1, "coarse fringes"), ("INCONSISTENT", 0.05, "out of order"),
-    ("LOW_MODULATION", 0.3, "expose longer"),
+    ("LOW_MODULATION", 0.9, "expose longer"),
 ])  # fmt: skip
 def test_the_verdict_names_the_camera_the_share_and_what_to_do(reason, part, advice):
     v = denoise.verdict(lossy(**{reason: part}))
@@ -336,7 +336,7 @@ def test_the_verdict_names_the_camera_the_share_and_what_to_do(reason, part, adv
 
 def test_the_verdict_is_quiet_about_what_is_usual():
     v = denoise.verdict(lossy(DARK=0.5, SATURATED=0.001, JUMP=0.01, NOT_LOCAL=0.01))
-    assert v.words == ("camera2: 4790 points on 5000 lit pixels of 10000",)
+    assert v.words == ("camera2: 4790 points on 5000 pixels with fringes of 10000",)
 
 
 def test_shares_are_of_the_lit_pixels():

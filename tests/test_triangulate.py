@@ -108,8 +108,8 @@ def test_the_ray_meets_the_equiphase_surface_where_bisection_finds_it(seed):
     (g,) = gradients(rig, rng, 1)
     o, d = rays.camera_rays(rig.cameras[0])
     middle = np.linalg.norm(target - o)
-    p0 = o + middle * d
-    phi = (rays.phase(rig.projector, g, p0).reshape(d.shape[:2]) + rng.uniform(-8, 8, d.shape[:2])).astype(np.float32)
+    p0 = o + (middle + rng.uniform(-40, 40, d.shape[:2]))[..., None] * d
+    phi = rays.phase(rig.projector, g, p0).reshape(d.shape[:2]).astype(np.float32)
     out = triangulate.grid(decoded([g], [phi], [0.01]), np.zeros(phi.shape, np.uint16), rig, volume_margin=5)
     for i, j in ((0, 0), (4, 6), (8, 11), (2, 9)):
         want = rays.meet(rig.projector, g, float(phi[i, j]), o, d[i, j], middle - 60, middle + 60)

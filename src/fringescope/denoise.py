@@ -46,8 +46,8 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
     if not decoded.sets:  # Gray code alone: background and modulation are the contrast of the bits
         out[s.min_modulation * scale > B] |= np.uint16(Reason.LOW_MODULATION)
         return out
-    dark = s.min_background * scale > A
     noise = np.sqrt(decoded.noise.variance(A))
+    dark = s.min_background * scale > A
     low = (s.min_modulation * scale > B) | (s.min_contrast * A > B) | (s.min_modulation_sigma * noise > B)
     out[dark] |= np.uint16(Reason.DARK)
     out[low] |= np.uint16(Reason.LOW_MODULATION)
@@ -66,6 +66,7 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
         if len(family) > 1:
             out[ok & _fine_contrast_lost(family[-2], family[-1], ok, s)] |= np.uint16(Reason.LOW_MODULATION)
     out[dark] &= ~np.uint16(Reason.ORDER_UNCERTAIN | Reason.INCONSISTENT)
+    out[(out & Reason.LOW_MODULATION) != 0] &= ~np.uint16(Reason.ORDER_UNCERTAIN)
     return out
 
 
@@ -190,23 +191,25 @@ def verdict(grid: Grid) -> ViewVerdict:
     n = int(grid.reasons.size)
     lost = {r.name.lower(): int(((grid.reasons & r) != 0).sum()) for r in Reason if r.name}
     points = int((grid.reasons == 0).sum())
-    lit = n - lost["dark"]
-    blamed = np.where(grid.reasons & Reason.DARK, np.uint16(Reason.DARK), grid.reasons)
-    words = [f"{grid.camera}: {points} points on {lit} lit pixels of {n}"]
+    without = (grid.reasons & (Reason.DARK | Reason.LOW_MODULATION)) != 0
+    lit = n - int(without.sum())
+    words = [f"{grid.camera}: {points} points on {lit} pixels with fringes of {n}"]
     if not points:
         words.append(f"{grid.camera}: no point was left")
     for reason, share, advice in _ADVICE:
-        part = float(((blamed & reason) != 0).sum()) / (n if reason is Reason.DARK else max(lit, 1))
+        hit = (grid.reasons & reason) != 0
+        weak = reason in (Reason.DARK, Reason.LOW_MODULATION)
+        part = float(hit.sum()) / n if weak else float((hit & ~without).sum()) / max(lit, 1)
         if part > share:
             words.append(f"{grid.camera}: {100 * part:.1f} % {reason.label}: {advice}")
     return ViewVerdict(grid.camera, n, points, lost, tuple(words))
 
 
-#: reason, share of the lit pixels (of all pixels for DARK) above which it is worth a word, and what to do
+#: reason, share of the pixels with fringes (DARK, LOW_MODULATION: of all) above which it is worth a word, what to do
 _ADVICE = (
     (Reason.DARK, 0.97, "no fringes reached this view: check lens cap, trigger and projector"),
     (Reason.SATURATED, 0.01, "halve the exposure, or add a shorter bracket"),
-    (Reason.LOW_MODULATION, 0.15, "shadow, defocus or scattered light: expose longer, refocus, turn it"),
+    (Reason.LOW_MODULATION, 0.8, "hardly any fringes: expose longer, refocus, or bring the specimen into the light"),
     (Reason.ORDER_UNCERTAIN, 0.02, "the coarse fringes are too noisy: add a set between, or light"),
     (Reason.REVERSED, 0.005, "mirrored fringes: dry the surface or put something dark below it"),
     (Reason.JUMP, 0.05, "edges and steep walls: turn the specimen"),

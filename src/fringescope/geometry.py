@@ -131,6 +131,17 @@ def phase_at(projector: Projector, g: tuple[float, float], p_world: ArrayLike) -
     return np.asarray(2 * np.pi * (uv[..., 0] * g[0] + uv[..., 1] * g[1]))
 
 
+def check_baseline(rig: Rig, camera: Camera) -> None:
+    """Raise RigError if a camera stands where the projector is: without a baseline the fringes do not tell depth."""
+    c, p = centre(camera.pose), centre(rig.projector.pose)
+    away = max(float(np.linalg.norm(camera.pose.t)), float(np.linalg.norm(rig.projector.pose.t)), 1.0)
+    if np.linalg.norm(c - p) < 1e-3 * away:
+        raise RigError(
+            f"camera '{camera.name}' and the projector stand at the same place ({np.linalg.norm(c - p):.3g} mm apart); "
+            "depth needs a baseline: check R and t in the rig"
+        )
+
+
 def measuring_space(rig: Rig, camera: Camera, p_world: ArrayLike, margin: float) -> Bool:
     """Whether world points (..., 3) may carry a specimen seen by `camera`.
 

@@ -395,7 +395,7 @@ def _faults(rig: Rig, view: ViewPlan, s: PatternSettings) -> Iterator[str]:
     if result.order_error > s.max_order_error and not coded:
         yield (
             f"{result.order_error:.1e} wrong orders expected at modulation {s.design_modulation:g}, "
-            f"more than {s.max_order_error:g}; add a set or steps"
+            f"more than {s.max_order_error:g}; add a set or steps, or take --plan planned"
         )
     loss = float(result.depth_sigma_mm[0] / predict(rig, _best(rig, view), *signal).depth_sigma_mm[0])
     if loss > 1.2:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fringescope import denoise, fuse, phase, triangulate
+from fringescope import denoise, fuse, geometry, phase, triangulate
 from fringescope.errors import EmptyResultError
 from fringescope.settings import Settings
 from fringescope.types import Decoded, Grid, Photo, Rig, Scan, Surface, ViewInput
@@ -37,7 +37,7 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
 
     Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do.
     """
-    rig.camera(view.plan.camera)
+    geometry.check_baseline(rig, rig.camera(view.plan.camera))
     decoded = phase.measure(view.frames, view.plan, s.phase, view.noise)  # II-C; frames may still be arriving
     decoded = phase.settle_order(decoded, view.plan, s.phase, rig, s.denoise.volume_margin)
     reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)  # III-D 1

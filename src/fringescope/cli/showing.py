@@ -118,8 +118,9 @@ def demo(
         store.write_json(tmp / "demo.json", store.plain(told))
     lines = scan_summary(doc, out / "scan")
     lines.append(
-        f"against the truth: std {found['std_um']:.1f} um, 99 % within {found['p99_um']:.0f} um, "
-        f"bias {found['bias_um']:+.2f} um over {found['points']} points"
+        f"against the truth, along the rays: std {found['std_um']:.1f} um, rms {found['rms_um']:.1f} um, 99 % within "
+        f"{found['p99_um']:.0f} um, bias {found['bias_um']:+.2f} um; {found['flying_ppm']:.0f} of a million points "
+        f"are off by more than 0.3 mm ({found['points']} points of all views)"
     )
     lines += [
         f"{out / n}" for n in ("capture", "scan", "error_map.png", "surface.png", "relief.png") if (out / n).exists()

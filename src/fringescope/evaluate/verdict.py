@@ -61,6 +61,8 @@ def evaluate(
     """
     if fit not in ("plane", "sphere"):
         raise UsageError(f"fit '{fit}'; needed \"plane\" or \"sphere\"")
+    if not 0 < band_mm < np.inf:
+        raise UsageError(f"band of {band_mm} mm; needed a positive length")
     every = np.asarray(xyz, dtype=np.float64)
     if every.ndim != 2 or every.shape[1] != 3:
         raise UsageError(f"points of shape {every.shape}; needed (n, 3)")

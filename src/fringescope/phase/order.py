@@ -27,6 +27,7 @@ from fringescope.types import (
     WrappedSet,
 )
 
+MOST_REPEATS = 2.5  #: of what the sets tell apart, that a ray may cross in the measuring space
 PARALLEL_RAD = 1e-4  #: sets whose gradients differ less than this in angle (either sign) unwrap each other
 
 
@@ -101,7 +102,18 @@ def settle_order(
                 )
         else:
             bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
+            span = unambiguous_span(group, 4 * s.systematic_rad)
+            room = float(np.median(bounds[3] - bounds[2])) / (2 * math.pi * math.hypot(*g))
+            if gray is None and room > MOST_REPEATS * span:
+                raise DecodeError(
+                    f"view '{plan.camera}': the sets along ({g[0]:.4g}, {g[1]:.4g}) repeat after {span:.0f} projector "
+                    f"units, a ray crosses {room:.0f} in the measuring space; add a coarser period or a Gray code, or "
+                    f"give the rig a smaller volume"
+                )
         direction, bad = _unwrap(group, bounds, gray, half, soft, s)
+        if rig is not None:  # no order leads into the measuring space
+            lost = ~np.isfinite(direction.phase) & np.isfinite(direction.sigma)
+            bad[lost] = np.uint16(Reason.OUT_OF_VOLUME)
         out.append(direction)
         reasons |= bad
     for i, code in enumerate(decoded.gray):
