@@ -90,7 +90,7 @@ def test_a_background_serves_as_picture():
     ],
 )
 def test_wrong_shapes_are_named(raw, fmt):
-    with pytest.raises(CaptureError, match="camera 'camera9': (a picture of|8 x 2 pixels)"):
+    with pytest.raises(CaptureError, match=r"camera 'camera9': (a picture of|8 x 2 pixels)"):
         fuse.photo(raw, fmt, "camera9")
 
 
