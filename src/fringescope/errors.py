@@ -25,6 +25,10 @@ class DecodeError(FringescopeError):
     """The sets of a view cannot be decoded to an absolute phase."""
 
 
+class CalibrationError(FringescopeError):
+    """Board pictures that do not make a rig: no board, too few or too similar poses, a board that is not as described."""
+
+
 class EmptyResultError(FringescopeError):
     """Nothing was left to return, for a reason that the message states."""
 

@@ -143,6 +143,29 @@ class PatternSettings(_Section):
 
 
 @dataclass(frozen=True)
+class BoardSettings(_Section):
+    """Finding the board and what the projector shows on it (III-B, Fig. 4)."""
+
+    edge_clearance: float = knob(0.2, "squares", "samples of the projector's phase stay this far from the edges of their white square", "III-B", 0.02, 0.45)
+    max_samples: int = knob(4000, "", "samples of the projector's phase per picture at most, spread over all white squares", "III-B", 50)
+
+
+@dataclass(frozen=True)
+class CalibrateSettings(_Section):
+    """Board pictures to a rig: one joint adjustment (III-B)."""
+
+    min_poses: int = knob(3, "poses", "fewest poses that are solved at all; eight to ten are good", "III-B", 3)
+    square_pixels: bool = knob(False, "", "cameras have square pixels: fx = fy", "III-B")
+
+
+@dataclass(frozen=True)
+class ResponseSettings(_Section):
+    """The response of projector and camera together: gamma, saturation (II-C)."""
+
+    harmonics: int = knob(4, "", "harmonics of the fringe that are looked at", "II-C", 1, 16)
+
+
+@dataclass(frozen=True)
 class CaptureSettings(_Section):
     """Playing patterns and proving that frame n is pattern n."""
 
@@ -164,6 +187,9 @@ class Settings(_Section):
     mesh: MeshSettings = field(default_factory=MeshSettings)
     patterns: PatternSettings = field(default_factory=PatternSettings)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
+    board: BoardSettings = field(default_factory=BoardSettings)
+    calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
+    response: ResponseSettings = field(default_factory=ResponseSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:

@@ -4,6 +4,7 @@ Letters of the axes, everywhere: N frames, H rows, W columns, V views, D fringe 
 radians; projector-plane units for fringe periods. `T_ab` maps b to a. See `docs/conventions.md`.
 """
 
+from fringescope.types.calibration import I32, Board, Calibration, LeftOut, Parameter, Residuals, Sighting
 from fringescope.types.capture import (
     FrameKey,
     FringeSet,
@@ -33,11 +34,14 @@ from fringescope.types.rig import Camera, Lens, Pose, Projector, Rig, Volume, pl
 __all__ = [
     "F32",
     "F64",
+    "I32",
     "U8",
     "U16",
     "U32",
     "AnyArray",
+    "Board",
     "Bool",
+    "Calibration",
     "Camera",
     "Cloud",
     "Decoded",
@@ -48,14 +52,17 @@ __all__ = [
     "GraySet",
     "Grid",
     "Layout",
+    "LeftOut",
     "Lens",
     "NoiseModel",
+    "Parameter",
     "PatternPlan",
     "Photo",
     "PixelFormat",
     "Pose",
     "Projector",
     "Reason",
+    "Residuals",
     "Rig",
     "Role",
     "Scan",
