@@ -132,8 +132,8 @@ class Calibration:
     """A solved rig and everything needed to judge it or to solve it again.
 
     `boards` maps pose names to T_world_board. `covariance` (p, p) belongs to the free ones of `parameters` in their
-    order, then six per pose (rotation vector, translation of T_world_board). `noise` holds the standard deviations that the solve settled on per
-    kind of measurement, e.g. {"camera1 corners px": 0.02, "camera1 projector px": 0.03}.
+    order, then six per pose (rotation vector, translation of T_world_board). `noise` holds the standard deviations that
+    the solve settled on per kind of measurement, e.g. {"camera1 corners px": 0.02, "camera1 projector px": 0.03}.
     """
 
     rig: Rig
