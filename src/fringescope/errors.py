@@ -26,7 +26,7 @@ class DecodeError(FringescopeError):
 
 
 class CalibrationError(FringescopeError):
-    """Board pictures that do not make a rig: no board, too few or too similar poses, a board that is not as described."""
+    """Board pictures that do not make a rig: no board, too few or too similar poses, another board than described."""
 
 
 class EmptyResultError(FringescopeError):

@@ -66,6 +66,7 @@ __all__ = [
     "Rig",
     "Role",
     "Scan",
+    "Sighting",
     "Surface",
     "SurfacePart",
     "ViewInput",
