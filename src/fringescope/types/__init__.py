@@ -4,7 +4,22 @@ Letters of the axes, everywhere: N frames, H rows, W columns, V views, D fringe 
 radians; projector-plane units for fringe periods. `T_ab` maps b to a. See `docs/conventions.md`.
 """
 
-from fringescope.types.calibration import I32, Board, Calibration, LeftOut, Parameter, Residuals, Sighting
+from fringescope.types.calibration import (
+    I32,
+    Board,
+    Calibration,
+    Coverage,
+    Evidence,
+    FieldTest,
+    HeldOut,
+    LeftOut,
+    Parameter,
+    PoseFigures,
+    Prediction,
+    Residuals,
+    Sighting,
+    Slice,
+)
 from fringescope.types.capture import (
     FrameKey,
     FringeSet,
@@ -44,13 +59,17 @@ __all__ = [
     "Calibration",
     "Camera",
     "Cloud",
+    "Coverage",
     "Decoded",
     "Direction",
+    "Evidence",
+    "FieldTest",
     "FrameKey",
     "FringeSet",
     "GrayCode",
     "GraySet",
     "Grid",
+    "HeldOut",
     "Layout",
     "LeftOut",
     "Lens",
@@ -60,6 +79,8 @@ __all__ = [
     "Photo",
     "PixelFormat",
     "Pose",
+    "PoseFigures",
+    "Prediction",
     "Projector",
     "Reason",
     "Residuals",
@@ -67,6 +88,7 @@ __all__ = [
     "Role",
     "Scan",
     "Sighting",
+    "Slice",
     "Surface",
     "SurfacePart",
     "ViewInput",

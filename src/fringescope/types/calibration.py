@@ -104,7 +104,11 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One solved number: of which device (or "board"), its name (fx, k1, ..), value, standard deviation, unit."""
+    """One solved number: of which device ("projector", a camera's name, "board"), name, value, sigma, unit.
+
+    Names of a device: fx fy cx cy k1 k2 p1 p2 k3 of its lens (f = fx and fy as one); rx ry rz (rad) and tx ty tz (mm)
+    of its pose T_device_world, where a change w of (rx, ry, rz) turns R into exp(w) R and leaves t as it is.
+    """
 
     device: str
     name: str
@@ -146,3 +150,124 @@ class Calibration:
     noise: Mapping[str, float]
     left_out: tuple[LeftOut, ...] = ()
     figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+# -------------------------------------------------------------------------------------------------------------- evidence
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One pose left out of the solve; its board then fitted with the rig of the other poses held fixed. NaN = none.
+
+    Corners are triangulated from the camera's pixel and the projector's coordinate and compared with the board.
+    """
+
+    pose: str
+    corners: int  #: how many were compared
+    corner_mm_rms: float  #: distance from the board's grid after a rigid fit
+    corner_px_rms: float  #: reprojection of the corners into the cameras
+    sample_rms: float  #: phase residual in projector-plane units
+    sample_um_rms: float  #: the same along the camera's ray
+    scale: float  #: measured over true size of the board
+
+
+@dataclass(frozen=True)
+class FieldTest:
+    """Whether a device's residuals are noise about nothing: spread, symmetry about zero, a smooth field that repeats.
+
+    Probabilities come from turning the signs of whole sightings, so residuals that belong together stay together; they
+    can be no smaller than 2 / 2^sightings. NaN = too few to tell.
+    """
+
+    device: str
+    kind: str  #: "corners" (camera pixels) or "phase" (projector-plane units)
+    unit: str
+    vectors: int
+    sightings: int
+    rms: float  #: of a vector's length
+    mean: tuple[float, float]
+    asymmetry: float  #: energy distance between r and -r over its largest value: 0 = centrosymmetric, 1 = all alike
+    asymmetry_p: float
+    field_rms: float  #: of a cubic vector field fitted over the image
+    field_noise: float  #: what noise alone gives for it (median over turned signs)
+    field_p: float  #: of the field, whole sightings turned
+    field_f_p: float  #: of the field, F-test as if all residuals were independent
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Where in a device's picture the boards were, and how they were tilted towards it.
+
+    `cells` counts corners (projector: samples) in 6 rows of 8; -1 = a cell that no other device looks at, which needs
+    none. Tilts: (pose, tilt_rad, azimuth_rad), the angle between the board's normal and the line of sight, and where
+    in the image the side turned towards the device points (0 = right, pi/2 = down).
+    """
+
+    device: str
+    cells: tuple[tuple[int, ...], ...]
+    share: float  #: of the cells that matter
+    missing: tuple[str, ...]  #: regions in words: "lower left"
+    tilts: tuple[tuple[str, float, float], ...]
+    near_mm: float  #: nearest board point along the device's axis
+    far_mm: float
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Predicted systematic sigma of points in one plane of the measuring volume: (rows, columns) in um; NaN = unseen.
+
+    `extent_mm` = (x0, x1, y0, y1) and `z_mm` in world mm (along the volume's axes where it is turned).
+    """
+
+    z_mm: float
+    extent_mm: tuple[float, float, float, float]
+    sigma_um: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the covariance of the calibration says of measured points, rigid movements of the whole scene left aside.
+
+    `median_um`, `p95_um`, `max_um` per camera: (3D, the root of the trace). `views_um`: median and largest predicted
+    height difference of the surfaces of two cameras, per pair.
+    """
+
+    points: int
+    per_camera: Mapping[str, tuple[float, float, float]]
+    views_um: Mapping[str, tuple[float, float]]
+    slices: Mapping[str, tuple[Slice, ...]]
+    scale_ppm: float  #: standard deviation of the overall scale
+
+
+@dataclass(frozen=True)
+class PoseFigures:
+    """One row of the report's table: residuals per camera, corners in pixels and phase in projector-plane units."""
+
+    pose: str
+    corner_px: Mapping[str, float]
+    sample_units: Mapping[str, float]
+    corners: int
+    samples: int
+    held_out: HeldOut | None
+    tilt_rad: float  #: against the projector's axis
+    depth_mm: float  #: of the board's middle, along the projector's axis
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that a person needs to trust a calibration, or not: plain figures and words.
+
+    `verdict` is "good", "usable" or "do not use"; `good`, `weak` and `next` say why and what to photograph next.
+    """
+
+    verdict: str
+    good: tuple[str, ...]
+    weak: tuple[str, ...]
+    next: tuple[str, ...]
+    fields: tuple[FieldTest, ...]
+    coverage: tuple[Coverage, ...]
+    poses: tuple[PoseFigures, ...]
+    correlations: tuple[tuple[str, str, float], ...]  #: pairs of parameters, |rho| largest first
+    prediction: Prediction | None
+    figures: Mapping[str, float] = field(default_factory=dict)
