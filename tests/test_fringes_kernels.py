@@ -309,7 +309,7 @@ def test_order_votes_equal_their_twin(seed):
     p[rng.random(p.shape) < 0.1] = np.nan
     out, changed = np.empty_like(p), np.empty(p.shape, np.int8)
     voters = np.where(rng.random(p.shape) < 0.2, np.float32(np.nan), p)
-    kernels.order_votes(p, voters, 2, 6, 0.7, 0.9, out, changed)
+    kernels.order_votes(p, voters, np.ones(p.shape, bool), 2, 6, 0.7, 0.9, out, changed)
     want, want_changed = reference.votes(p, voters, 2, 6, 0.7, 0.9)
     np.testing.assert_array_equal(changed, want_changed)
     np.testing.assert_allclose(out, want, atol=1e-4)

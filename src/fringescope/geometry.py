@@ -189,6 +189,11 @@ def phase_bounds(
     The arrays span the image corner on corner; rays that miss a space take the bounds of the nearest ray that meets it.
     Raises RigError if none does.
     """
+    return _phase_bounds(rig, camera, (float(g[0]), float(g[1])), margin, size).copy()
+
+
+@lru_cache(maxsize=64)
+def _phase_bounds(rig: Rig, camera: Camera, g: tuple[float, float], margin: float, size: tuple[int, int]) -> F64:
     h, w = size
     L = camera.lens
     v, u = np.meshgrid(np.linspace(0, L.height - 1, h), np.linspace(0, L.width - 1, w), indexing="ij")

@@ -63,7 +63,7 @@ def grid(
 
 
 def _outside(rig: Rig, name: str, xyz: F32, reasons: U16, margin: float) -> None:
-    """Mark points outside the measuring space and on the rim of the projector's field, row block by row block.
+    """Mark points outside the measuring space and on the rim of the projector's field.
 
     A camera pixel that straddles the rim saw half a fringe: half its footprint, in projector units, is the margin.
     """
@@ -77,10 +77,11 @@ def _outside(rig: Rig, name: str, xyz: F32, reasons: U16, margin: float) -> None
     units_per_mm = np.array([projector.lens.K[0, 0], projector.lens.K[1, 1]]) / z_projector
     rim = np.maximum(0.5 * footprint * units_per_mm, 0.5)
     high = np.array(projector.plane_size) - 1 - rim
-    for row in range(0, xyz.shape[0], 256):
-        block, r = xyz[row : row + 256], reasons[row : row + 256]
-        with np.errstate(invalid="ignore"):
-            uv = geometry.project(projector, block)
-            ok = ((uv >= rim) & (uv <= high)).all(axis=-1) & geometry.measuring_space(rig, camera, block, margin)
-            out = (r == 0) & ~ok
-        r[out] |= np.uint16(Reason.OUT_OF_VOLUME)
+    if rig.volume is not None:
+        box = rig.volume.center, rig.volume.axes, rig.volume.half_size * margin
+    else:  # the slab of depths that all devices share: see `geometry.measuring_space`
+        near, far = geometry.common_depths(rig, camera)
+        middle = geometry.transform(geometry.inverse(camera.pose), [0.0, 0.0, (near + far) / 2])
+        box = middle, camera.pose.R, np.array([np.inf, np.inf, (far - near) / 2])
+    lens, bit = geometry.lens_vector(projector.lens), np.uint16(Reason.OUT_OF_VOLUME)
+    rays.mark_outside(xyz, projector.pose.R, projector.pose.t, lens, rim, high, *box, reasons, bit)

@@ -251,38 +251,52 @@ def unwrap(first, last, phases, sigmas, freq, bounds, unexpected, gray, gray_hal
 
 
 @by_rows(lambda phase, *_: phase.shape[0])
-def order_votes(first, last, phase, voters, radius, least, majority, max_slope, out, changed):
-    """Let the neighbours vote on each pixel's order: `out` = phase + 2 pi (elected order - own).
+def order_votes(first, last, phase, voters, asked, radius, least, majority, max_slope, out, changed):
+    """Let the neighbours vote on the order of each pixel that is `asked`: `out` = phase + 2 pi (elected order - own).
 
     Each of the `voters` (a phase image, NaN = does not vote) votes for the order that brings this pixel nearest to
     it, if the wrapped difference is below `max_slope` times the distance. The own order stays unless another, at most
     8 away, holds `majority` of at least `least` votes. `changed` (int8) gets the elected change of order, 127 where
-    the majority confirms the own order, -128 where no order has the majority, 0 where too few voted.
+    the majority confirms the own order, -128 where no order has the majority, 0 where too few voted; it stays what it
+    was where nobody asked.
     """
     H, W = phase.shape
+    counts = np.zeros(17, np.int64)
     for i in range(first, last):
         for j in range(W):
             p = phase[i, j]
             out[i, j] = p
+            if not asked[i, j]:
+                continue
             changed[i, j] = 0
             if p != p:
                 continue
-            counts = np.zeros(17, np.int64)
-            votes = 0
+            votes = own = 0
             for y in range(max(i - radius, 0), min(i + radius + 1, H)):
                 for x in range(max(j - radius, 0), min(j + radius + 1, W)):
                     q = voters[y, x]
                     if (y == i and x == j) or q != q:
                         continue
+                    limit = max_slope * max(abs(y - i), abs(x - j))
+                    if abs(q - p) < math.pi:
+                        if abs(q - p) <= limit:
+                            votes += 1
+                            own += 1
+                        continue
                     turns = math.floor((q - p) / TWO_PI + 0.5)
-                    reach = max(abs(y - i), abs(x - j))
-                    if abs(q - p - TWO_PI * turns) > max_slope * reach:
+                    if abs(q - p - TWO_PI * turns) > limit:
                         continue
                     votes += 1
                     if turns >= -8 and turns <= 8:
                         counts[int(turns) + 8] += 1
-            if votes < least:
+            if own == votes:
+                if votes >= least:
+                    changed[i, j] = 127
                 continue
+            if votes < least:
+                counts[:] = 0
+                continue
+            counts[8] += own
             top = 8
             for t in range(17):
                 if counts[t] > counts[top]:
@@ -294,6 +308,7 @@ def order_votes(first, last, phase, voters, radius, least, majority, max_slope, 
                 changed[i, j] = 127
             elif counts[8] < (1.0 - majority) * votes:
                 changed[i, j] = -128
+            counts[:] = 0
 
 
 @by_rows(lambda frame, *_: frame.shape[0])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fringescope.kernels.lens import distort_jacobian, from_plane
+from fringescope.kernels.lens import distort_jacobian, from_plane, to_plane
 from fringescope.threads import by_rows
 
 TWO_PI = 2.0 * math.pi
@@ -117,3 +117,27 @@ def triangulate(
             sigma_mm[i, j] = math.sqrt((x * x + y * y + 1.0) / information)
             if used > 1:
                 miss[i, j] = math.sqrt(chi2 / (used - 1))
+
+
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def mark_outside(first, last, xyz, R, t, lens, low, high, centre, axes, half_size, reasons, bit):
+    """Give `bit` to points (H, W, 3) whose reasons are 0 and that lie outside the box or off the projector's field.
+
+    The box: `centre` (3,), unit vectors in the rows of `axes` (3, 3), `half_size` (3,). The field: from `low` to `high`
+    (2,) on the plane of the projector with pose R, t and `lens`.
+    """
+    for i in range(first, last):
+        for j in range(xyz.shape[1]):
+            if reasons[i, j] != 0:
+                continue
+            x, y, z = float(xyz[i, j, 0]), float(xyz[i, j, 1]), float(xyz[i, j, 2])
+            X = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
+            Y = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
+            Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+            u, v = to_plane(X / Z, Y / Z, lens)
+            inside = Z > 0.0 and low[0] <= u <= high[0] and low[1] <= v <= high[1]
+            for k in range(3):
+                along = axes[k, 0] * (x - centre[0]) + axes[k, 1] * (y - centre[1]) + axes[k, 2] * (z - centre[2])
+                inside = inside and abs(along) <= half_size[k]
+            if not inside:
+                reasons[i, j] |= bit

@@ -177,6 +177,7 @@ def _solve(M, rhs, n):
 
     Returns (ok, element (0, 0) of the inverse); the solution is in `rhs`.
     """
+    inv00 = 0.0
     for a in range(n):
         for b in range(a + 1):
             s = M[a, b]
@@ -188,24 +189,64 @@ def _solve(M, rhs, n):
                 M[a, a] = math.sqrt(s)
             else:
                 M[a, b] = s / M[b, b]
-    inv00 = 0.0
-    e = np.zeros(6)
-    e[0] = 1.0
     for a in range(n):
         s = rhs[a]
-        t = e[a]
+        t = 1.0 if a == 0 else 0.0
         for c in range(a):
             s -= M[a, c] * rhs[c]
-            t -= M[a, c] * e[c]
+            t -= M[a, c] * M[n, c]
         rhs[a] = s / M[a, a]
-        e[a] = t / M[a, a]
-        inv00 += e[a] * e[a]
+        M[n, a] = t / M[a, a]
+        inv00 += M[n, a] * M[n, a]
     for a in range(n - 1, -1, -1):
         s = rhs[a]
         for c in range(a + 1, n):
             s -= M[c, a] * rhs[c]
         rhs[a] = s / M[a, a]
     return True, inv00
+
+
+@njit(cache=True, error_model="numpy")
+def _normal_equations(x, y, value, weight, n, terms, M, rhs):
+    """Least squares of 1, x, y, x^2, x y, y^2 (the first `terms`): the lower triangle of M (7, 6) and rhs (6,)."""
+    m00 = m10 = m01 = m20 = m11 = m02 = 0.0
+    m30 = m21 = m12 = m03 = m40 = m31 = m22 = m13 = m04 = 0.0
+    r0 = r1 = r2 = r3 = r4 = r5 = 0.0
+    for k in range(n):
+        a, b, w = x[k], y[k], weight[k]
+        aa, ab, bb = a * a, a * b, b * b
+        v = w * value[k]
+        m00 += w
+        m10 += w * a
+        m01 += w * b
+        m20 += w * aa
+        m11 += w * ab
+        m02 += w * bb
+        r0 += v
+        r1 += v * a
+        r2 += v * b
+        if terms == 6:
+            m30 += w * aa * a
+            m21 += w * aa * b
+            m12 += w * a * bb
+            m03 += w * bb * b
+            m40 += w * aa * aa
+            m31 += w * aa * ab
+            m22 += w * aa * bb
+            m13 += w * ab * bb
+            m04 += w * bb * bb
+            r3 += v * aa
+            r4 += v * ab
+            r5 += v * bb
+    M[0, 0] = m00
+    M[1, 0], M[1, 1] = m10, m20
+    M[2, 0], M[2, 1], M[2, 2] = m01, m11, m02
+    rhs[0], rhs[1], rhs[2] = r0, r1, r2
+    if terms == 6:
+        M[3, 0], M[3, 1], M[3, 2], M[3, 3] = m20, m30, m21, m40
+        M[4, 0], M[4, 1], M[4, 2], M[4, 3], M[4, 4] = m11, m21, m12, m31, m22
+        M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = m02, m12, m03, m22, m13, m04
+        rhs[3], rhs[4], rhs[5] = r3, r4, r5
 
 
 @by_rows(lambda phase, *_: phase.shape[0])
@@ -217,12 +258,12 @@ def local_surface(first, last, phase, sigma, label, radius, least, out, roughnes
     sigma). `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
     """
     H, W = phase.shape
+    room = (2 * radius + 1) ** 2
+    dx, dy, value = np.empty(room), np.empty(room), np.empty(room)
+    inverse, weight = np.empty(room), np.empty(room)
+    M = np.empty((7, 6))
+    c = np.zeros(6)
     for i in range(first, last):
-        M = np.empty((6, 6))
-        rhs = np.empty(6)
-        coefficient = np.zeros(6)
-        basis = np.empty(6)
-        basis[0] = 1.0
         for j in range(W):
             out[i, j] = np.nan
             roughness[i, j] = np.nan
@@ -230,67 +271,43 @@ def local_surface(first, last, phase, sigma, label, radius, least, out, roughnes
             if own < 0:
                 continue
             n = 0
+            here = phase[i, j]
             for y in range(max(i - radius, 0), min(i + radius + 1, H)):
                 for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                    if label[y, x] == own:
-                        n += 1
-            n -= 1
+                    if label[y, x] != own or (y == i and x == j):
+                        continue
+                    dx[n] = x - j
+                    dy[n] = y - i
+                    value[n] = phase[y, x] - here
+                    s = float(sigma[y, x])
+                    inverse[n] = 1.0 / (s * s)
+                    weight[n] = inverse[n]
+                    n += 1
             if n < least:
                 continue
             terms = 6 if n >= 12 else 3
-            inv00 = 0.0
-            spread = 0.0
-            fine = False
-            for sweep in range(4):
-                for a in range(terms):
-                    rhs[a] = 0.0
-                    for b in range(a + 1):
-                        M[a, b] = 0.0
-                worst = 0.0
-                spread = 0.0
-                weight_sum = 0.0
-                for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-                    for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                        if label[y, x] != own or (y == i and x == j):
-                            continue
-                        dx = float(x - j)
-                        dy = float(y - i)
-                        basis[1] = dx
-                        basis[2] = dy
-                        basis[3] = dx * dx
-                        basis[4] = dx * dy
-                        basis[5] = dy * dy
-                        value = phase[y, x] - phase[i, j]
-                        s = sigma[y, x]
-                        w = 1.0
-                        if sweep > 0:
-                            r = value
-                            for a in range(terms):
-                                r -= coefficient[a] * basis[a]
-                            z2 = (r / s) ** 2
-                            worst = max(worst, z2)
-                            w = 1.0 / (1.0 + z2 / 6.25)
-                            spread += w * z2
-                            weight_sum += w
-                        w /= s * s
-                        for a in range(terms):
-                            rhs[a] += w * basis[a] * value
-                            for b in range(a + 1):
-                                M[a, b] += w * basis[a] * basis[b]
-                if sweep > 0:
-                    spread = math.sqrt(spread / max(weight_sum * (1.0 - terms / n), 1.0))
-                    if worst < 9.0 or sweep == 3:
-                        fine = True
-                        break
-                ok, inv00 = _solve(M, rhs, terms)
+            c[3] = c[4] = c[5] = 0.0
+            for sweep in range(3):
+                _normal_equations(dx, dy, value, weight, n, terms, M, c)
+                ok, inv00 = _solve(M, c, terms)
                 if not ok:
                     break
-                for a in range(terms):
-                    coefficient[a] = rhs[a]
-            if fine:
-                yardstick = math.sqrt(sigma[i, j] ** 2 + inv00) * max(spread, 1.0)
-                out[i, j] = abs(coefficient[0]) / yardstick
-                roughness[i, j] = spread
+                worst = spread = weight_sum = 0.0
+                for k in range(n):
+                    a, b = dx[k], dy[k]
+                    r = value[k] - (c[0] + a * (c[1] + c[3] * a + c[4] * b) + b * (c[2] + c[5] * b))
+                    z2 = r * r * inverse[k]
+                    w = 1.0 / (1.0 + z2 / 6.25)
+                    worst = max(worst, z2)
+                    spread += w * z2
+                    weight_sum += w
+                    weight[k] = w * inverse[k]
+                if worst < 9.0 or sweep == 2:
+                    spread = math.sqrt(spread / max(weight_sum * (1.0 - terms / n), 1.0))
+                    yardstick = math.sqrt(sigma[i, j] ** 2 + inv00) * max(spread, 1.0)
+                    out[i, j] = abs(c[0]) / yardstick
+                    roughness[i, j] = spread
+                    break
 
 
 @by_rows(lambda _xyz, sigma, *_: sigma.shape[0])

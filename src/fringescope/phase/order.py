@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from fringescope import geometry
@@ -151,29 +152,35 @@ def _elect(absolute: F32, trusted: Bool, uncertain: Bool, s: PhaseSettings) -> t
     whole stays so.
     """
     nan = np.float32(np.nan)
-    slope = _usual_slope(np.where(trusted, absolute, nan))
+    voters = np.where(trusted, absolute, nan)
+    slope = _usual_slope(voters)
     radius = s.order_votes // 2
-    least = max(3, (2 * radius + 1) ** 2 // 4)
-    split = np.zeros(absolute.shape, bool)
+    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    least = max(3, window.size // 4)
     changed = np.zeros(absolute.shape, np.int8)
+    asked = np.ones(absolute.shape, bool)
     for _ in range(3):
         out = np.empty_like(absolute)
-        k.order_votes(absolute, np.where(trusted, absolute, nan), radius, least, s.order_majority, slope, out, changed)
-        split = changed == -128
-        moved = (np.abs(changed.astype(np.int16)) <= 8) & (changed != 0)
+        k.order_votes(absolute, voters, asked, radius, least, s.order_majority, slope, out, changed)
+        moved = asked & (changed != 0) & (changed >= -8) & (changed <= 8)
         absolute, uncertain = out, uncertain & ~moved
         if not moved.any():
             break
+        voters = np.where(trusted, absolute, nan)
+        asked = cv2.dilate(moved.view(np.uint8), window).view(bool)  # elsewhere the vote would be the same again
+    split = changed == -128
     sure = np.where(trusted & ~uncertain & ~split, absolute, nan)
-    k.order_votes(absolute, sure, radius, least, s.order_majority, slope, np.empty_like(absolute), changed)
+    k.order_votes(absolute, sure, uncertain, radius, least, s.order_majority, slope, out, changed)
     return absolute, np.asarray((uncertain & (changed != 127)) | split)
 
 
 def _usual_slope(phase: F32) -> float:
     """Largest believable phase slope, radians per pixel: four times the usual one, at most 1.2."""
     usual = 0.0
+    stride = max(1, math.isqrt(phase.size // 60_000))  # enough for a median
     for axis in (0, 1):
-        d = np.diff(phase, axis=axis)
+        every = phase[::stride] if axis == 1 else phase[:, ::stride]
+        d = np.diff(every, axis=axis)
         d = d[np.isfinite(d)]
         if d.size:
             usual = max(usual, float(np.median(np.abs(d))))
