@@ -1,12 +1,14 @@
 """The command line: each verb a few lines. `main` is the console script, `run` the same for tests."""
 
 from fringescope.cli.app import app, main, run
+from fringescope.cli.boards import board
 from fringescope.cli.capturing import devices, import_, patterns, settings_, simulate
 from fringescope.cli.scanning import decode, evaluate, export, reconstruct
 from fringescope.cli.showing import demo
 
 __all__ = [
     "app",
+    "board",
     "decode",
     "demo",
     "devices",
