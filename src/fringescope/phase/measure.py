@@ -116,3 +116,29 @@ def _merge(measured: Sequence[tuple[Measured, WrappedSet]]) -> list[WrappedSet]:
 def with_reasons(decoded: Decoded, reasons: U16) -> Decoded:
     """The same decoded view with other reasons (H, W)."""
     return replace(decoded, reasons=reasons)
+
+
+def crop_rows(decoded: Decoded, first: int, last: int) -> Decoded:
+    """Rows first to last - 1 of a decoded view, without its wrapped sets and codes."""
+
+    def crop(a: AnyArray) -> AnyArray:
+        return a[first:last].copy()
+
+    directions = tuple(replace(d, phase=crop(d.phase), sigma=crop(d.sigma), order_margin=crop(d.order_margin))
+                       for d in decoded.directions)  # fmt: skip
+    maps = {name: crop(getattr(decoded, name)) for name in ("background", "modulation", "reasons")}
+    return replace(decoded, directions=directions, sets=(), gray=(), **maps)
+
+
+def join_rows(parts: Sequence[Decoded]) -> Decoded:
+    """One decoded view of several, one below the other (see `crop_rows`)."""
+
+    def join(arrays: Sequence[AnyArray]) -> AnyArray:
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+    directions = tuple(
+        replace(same[0], **{n: join([getattr(d, n) for d in same]) for n in ("phase", "sigma", "order_margin")})
+        for same in zip(*(p.directions for p in parts), strict=True)
+    )
+    maps = {name: join([getattr(p, name) for p in parts]) for name in ("background", "modulation", "reasons")}
+    return replace(parts[0], directions=directions, **maps)
