@@ -182,6 +182,7 @@ class FieldTest:
     device: str
     kind: str  #: "corners" (camera pixels) or "phase" (projector-plane units)
     unit: str
+    size: tuple[int, int]  #: of the device's plane
     vectors: int
     sightings: int
     rms: float  #: of a vector's length
@@ -192,6 +193,9 @@ class FieldTest:
     field_noise: float  #: what noise alone gives for it (median over turned signs)
     field_p: float  #: of the field, whole sightings turned
     field_f_p: float  #: of the field, F-test as if all residuals were independent
+    arrows: tuple[tuple[float, float, float, float], ...]  #: some residuals to draw: u, v, du, dv (phase: patch means)
+    cloud: tuple[tuple[float, float], ...]  #: some single residuals
+    smooth: tuple[tuple[float, float, float, float], ...]  #: the fitted field
 
 
 @dataclass(frozen=True)
@@ -199,8 +203,8 @@ class Coverage:
     """Where in a device's picture the boards were, and how they were tilted towards it.
 
     `cells` counts corners (projector: samples) in 6 rows of 8; -1 = a cell that no other device looks at, which needs
-    none. Tilts: (pose, tilt_rad, azimuth_rad), the angle between the board's normal and the line of sight, and where
-    in the image the side turned towards the device points (0 = right, pi/2 = down).
+    none. Tilts: (pose, tilt_rad, azimuth_rad), the angle between the board's normal and the line of sight, and the
+    direction in the image into which the board faces (0 = right, pi/2 = down).
     """
 
     device: str
