@@ -155,26 +155,22 @@ class CalibrateSettings(_Section):
     """Board pictures to a rig: one joint adjustment (III-B)."""
 
     min_poses: int = knob(3, "poses", "fewest poses that are solved at all; eight to ten are good", "III-B", 3)
+    min_tilt_deg: float = knob(3.0, "deg", "boards that differ by less than this are all parallel", "III-B", 0, 90)
     square_pixels: bool = knob(False, "", "cameras have square pixels: fx = fy", "III-B")
-
-
-@dataclass(frozen=True)
-class EvidenceSettings(_Section):
-    """When a calibration is called good, usable or not to be used (III-B, V-A)."""
-
-    good_poses: int = knob(8, "poses", "fewer poses than this are called few", "III-B", 3)
-    min_coverage: float = knob(0.6, "", "share of the cells of a picture that boards should reach", "III-B", 0, 1)
-    min_tilt_deg: float = knob(8.0, "deg", "a side counts as tilted to if a board faces it by this much", "III-B", 0, 80)
-    min_depth: float = knob(0.2, "", "depth that boards should span, as a share of the width that they fill", "III-B", 0)
-    max_corner_px: float = knob(0.5, "pixels", "corners that miss by more than this are weak, four times as much is no calibration", "III-B", 0)
-    max_p: float = knob(0.01, "", "a pattern in the residuals counts as real below this probability", "III-B", 0, 1)
-    max_field: float = knob(0.5, "", "a real smooth field is weak above this share of the residuals' rms", "III-B", 0)
-    max_predicted_px: float = knob(0.1, "pixels", "predicted error of points, in footprints of a camera's pixel: more is weak, ten times as much is no calibration", "V-A", 0)
-    max_held_out: float = knob(2.0, "", "poses left out of the solve may fit this many times worse than those in it", "V-A", 1)
-    max_held_out_px: float = knob(1.0, "pixels", "corners of poses left out, triangulated, in footprints of a pixel: more is weak, three times as much is no calibration", "V-A", 0)
-    max_scale_ppm: float = knob(1500.0, "ppm", "the size of boards left out may be off by this", "V-A", 0)
-    tight_correlation: float = knob(0.95, "", "parameters correlated more than this are listed", "", 0, 1)
-    permutations: int = knob(4000, "", "turned signs that a probability is made of, where there are too many to try all", "", 100, 1_000_000)
+    lens: str = knob("auto", "", "distortion of the cameras: none, k1, k1 k2, k1 k2 p1 p2, k1 k2 p1 p2 k3; auto = chosen by leaving poses out", "III-B")
+    projector_lens: str = knob("auto", "", "distortion of the projector, likewise", "III-B")
+    lens_gain: float = knob(2.0, "", "how much better a lens term must make the poses left out, in chi-squared per term, to be used", "", 0)
+    projector: str = knob("samples", "", "what ties the projector: samples (phase at fixed camera pixels), centres (of white squares) or corners (phase read there)", "III-B, Fig. 4")
+    board_shape: str = knob("flat", "", "what the board may be but flat and true: flat, bend, print (spacing of rows over that of columns, shear), bend print", "")
+    bend_prior_mm: float = knob(0.3, "mm", "standard deviation of a board's sag at its corners, where it may bend", "", 1e-6)
+    print_prior: float = knob(0.003, "", "standard deviation of a print's scale ratio and shear, where they may differ from none", "", 1e-9)
+    focal: str = knob("", "plane units", "known focal lengths, such as camera1=12800+-50; projector=9120+-20", "")
+    principal_point: str = knob("", "plane units", "known principal points, such as camera1=2735,1823+-10", "")
+    camera_centre_prior: float = knob(0.1, "widths", "standard deviation of a camera's principal point about the middle of its picture: weak, for narrow fields that hardly tell", "", 1e-6)
+    projector_centre_prior: float = knob(2.0, "widths", "the same for the projector, whose lens is often shifted", "", 1e-6)
+    reject_sigma: float = knob(5.0, "sigma", "corners and samples that miss the solution by more than this are left out", "", 2)
+    reject_sighting: float = knob(5.0, "", "a picture whose corners or phases fit this many times worse than the others' is left out", "", 1.5)
+    rounds: int = knob(60, "", "steps of the adjustment at most", "", 1)
 
 
 @dataclass(frozen=True)
