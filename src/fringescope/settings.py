@@ -174,10 +174,37 @@ class CalibrateSettings(_Section):
 
 
 @dataclass(frozen=True)
+class EvidenceSettings(_Section):
+    """When a calibration is called good, usable or not to be used (III-B, V-A)."""
+
+    good_poses: int = knob(8, "poses", "fewer poses than this are called few", "III-B", 3)
+    min_coverage: float = knob(0.6, "", "share of the cells of a picture that boards should reach", "III-B", 0, 1)
+    min_tilt_deg: float = knob(8.0, "deg", "a side counts as tilted to if a board faces it by this much", "III-B", 0, 80)
+    min_depth: float = knob(0.2, "", "depth that boards should span, as a share of the width that they fill", "III-B", 0)
+    max_corner_px: float = knob(0.5, "pixels", "corners that miss by more than this are weak, four times as much is no calibration", "III-B", 0)
+    max_p: float = knob(0.01, "", "a pattern in the residuals counts as real below this probability", "III-B", 0, 1)
+    max_field: float = knob(0.5, "", "a real smooth field is weak above this share of the residuals' rms", "III-B", 0)
+    max_predicted_px: float = knob(0.1, "pixels", "predicted error of points, in footprints of a camera's pixel: more is weak, ten times as much is no calibration", "V-A", 0)
+    max_held_out: float = knob(2.0, "", "poses left out of the solve may fit this many times worse than those in it", "V-A", 1)
+    max_held_out_px: float = knob(1.0, "pixels", "corners of poses left out, triangulated, in footprints of a pixel: more is weak, three times as much is no calibration", "V-A", 0)
+    max_scale_ppm: float = knob(1500.0, "ppm", "the size of boards left out may be off by this", "V-A", 0)
+    tight_correlation: float = knob(0.95, "", "parameters correlated more than this are listed", "", 0, 1)
+    permutations: int = knob(4000, "", "turned signs that a probability is made of, where there are too many to try all", "", 100, 1_000_000)
+
+
+@dataclass(frozen=True)
 class ResponseSettings(_Section):
     """The response of projector and camera together: gamma, saturation (II-C)."""
 
     harmonics: int = knob(4, "", "harmonics of the fringe that are looked at", "II-C", 1, 16)
+
+
+@dataclass(frozen=True)
+class VerifySettings(_Section):
+    """Is a rig still true? (III-E)"""
+
+    limit: float = knob(4e-5, "working distances", "views, corners or a sphere that differ systematically by more than this say that the rig has drifted: 20 um at 500 mm", "III-E", 1e-7, 0.1)
+    limit_scale_ppm: float = knob(500.0, "ppm", "a board measured too large or too small by more than this, and three standard errors, says the same", "III-E", 0)
 
 
 @dataclass(frozen=True)
@@ -206,6 +233,7 @@ class Settings(_Section):
     calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     response: ResponseSettings = field(default_factory=ResponseSettings)
+    verify: VerifySettings = field(default_factory=VerifySettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:
