@@ -5,6 +5,9 @@ Everything takes arrays in world mm and returns frozen results; lengths in resul
 figure of the form contains it.
 """
 
+from fringescope.evaluate.agreement import Agreement, PairAgreement, agreement
+from fringescope.evaluate.board import BoardTrueness, board_trueness, corners_in_space
+from fringescope.evaluate.drift import Verdict, judge
 from fringescope.evaluate.plane import PlaneFit, fit_plane, measure_plane
 from fringescope.evaluate.repeat import Repeatability, repeatability
 from fringescope.evaluate.sphere import SphereFit, fit_sphere, fit_spheres
@@ -21,16 +24,24 @@ from fringescope.evaluate.verdict import Evaluation, evaluate
 
 __all__ = [
     "BAND_MM",
+    "Agreement",
+    "BoardTrueness",
     "Evaluation",
+    "PairAgreement",
     "PlaneFit",
     "Repeatability",
     "SphereFit",
     "Spread",
+    "Verdict",
+    "agreement",
     "along_rays",
+    "board_trueness",
+    "corners_in_space",
     "evaluate",
     "fit_plane",
     "fit_sphere",
     "fit_spheres",
+    "judge",
     "measure_plane",
     "neighbour_correlation",
     "repeatability",
