@@ -196,7 +196,18 @@ class EvidenceSettings(_Section):
 class ResponseSettings(_Section):
     """The response of projector and camera together: gamma, saturation (II-C)."""
 
-    harmonics: int = knob(4, "", "harmonics of the fringe that are looked at", "II-C", 1, 16)
+    correct: str = knob("off", "", "whether reconstruct and decode correct phases: off, file (a response.json that is given) or self (from the capture's own sets)", "II-C")
+    harmonics: int = knob(5, "", "harmonics of the fringe, from the second on, that may differ from the power law", "II-C", 1, 8)
+    law_tolerance: float = knob(0.02, "fringe amplitudes", "how far harmonics are expected to lie from the power law; what the capture does not show stays near it", "", 1e-4, 1)
+    expected_blur: float = knob(1.5, "projector-plane units", "blur of the projector that is expected (standard deviation); weakens the harmonics of fine fringes", "", 0.01, 50)
+    negligible_rad: float = knob(0.005, "rad", "a phase error that need not be corrected in the sets that measure", "", 0)
+    harmful_rad: float = knob(0.1, "rad", "a phase error that endangers orders, and is corrected, in the sets that only settle them", "", 0)
+    significance: float = knob(4.0, "sigma", "evidence that a correction needs", "", 0)
+    max_sigma_rad: float = knob(0.15, "rad", "pixels whose phase is noisier than this tell nothing of the response", "", 0.001)
+    min_contrast: float = knob(0.1, "", "least modulation, as a share of the background, of pixels that tell of the response", "", 0, 1)
+    min_pixels: int = knob(400, "pixels", "fewest pixels that tell of the response", "", 50)
+    max_pixels: int = knob(40_000, "pixels", "pixels that are looked at; more do not make it better", "", 1000)
+    max_saturated: float = knob(0.02, "", "share of the lit pixels that may saturate before it is said so", "", 0, 1)
 
 
 @dataclass(frozen=True)

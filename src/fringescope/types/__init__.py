@@ -31,6 +31,7 @@ from fringescope.types.capture import (
     ViewPlan,
 )
 from fringescope.types.names import F32, F64, U8, U16, U32, AnyArray, Bool, Layout, PixelFormat, Reason
+from fringescope.types.response import Response
 from fringescope.types.results import (
     Cloud,
     Decoded,
@@ -84,6 +85,7 @@ __all__ = [
     "Projector",
     "Reason",
     "Residuals",
+    "Response",
     "Rig",
     "Role",
     "Scan",

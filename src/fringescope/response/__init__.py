@@ -1,0 +1,39 @@
+"""The response of camera and projector together (gamma, saturation): measured, judged, and corrected by a table (II-C).
+
+`from_staircase`, `from_fringes`, `from_sets` and `from_exponents` measure a `Response`; `corrected` frees measured
+phases from its error before their orders are settled; `predistortion` is the table that makes the projector linear.
+"""
+
+from fringescope.response.judge import from_exponents, from_fringes, from_sets
+from fringescope.response.model import (
+    correct,
+    corrected,
+    curve,
+    gamma_harmonics,
+    greatest_error,
+    harmonics_at,
+    inverse_curve,
+    phase_error,
+    predicted_errors,
+    predistortion,
+    table,
+)
+from fringescope.response.staircase import from_staircase
+
+__all__ = [
+    "correct",
+    "corrected",
+    "curve",
+    "from_exponents",
+    "from_fringes",
+    "from_sets",
+    "from_staircase",
+    "gamma_harmonics",
+    "greatest_error",
+    "harmonics_at",
+    "inverse_curve",
+    "phase_error",
+    "predicted_errors",
+    "predistortion",
+    "table",
+]

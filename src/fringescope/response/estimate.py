@@ -1,0 +1,296 @@
+"""The response that makes a capture agree with itself: robust least squares on phases, modulations and residuals.
+
+Unknown are the exponent of a power law, what each harmonic differs from it (expected to be little), and the blur. Each
+pixel's own phase, gain and offset drop out of the equations:
+
+- pairs of sets that see one projector coordinate: their phases, their modulations and their backgrounds;
+- a set of more than three steps: what its samples leave beside the fringe (bins 2 .. N // 2);
+- where there is neither, a smooth surface: phase and modulation change evenly over half a ripple.
+
+Blocks of the image vote on how sure the result is, so that texture and shape, which are alike in neighbouring pixels,
+do not pass for evidence (cluster-robust covariance, doi 10.1093/biomet/73.1.13).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fringescope.response import model
+from fringescope.response.observe import Observed, Pair, Pixels, Triple
+from fringescope.settings import ResponseSettings
+from fringescope.types import F64, Bool
+
+ORDERS = 11  #: harmonics h_2 .. h_12 that the equations hold
+ROUNDS = 20
+TUKEY = 4.685  #: residuals beyond this many robust deviations have no say
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What was found: harmonics h_2 .. (ORDERS,) of sharp fringes with covariance, gamma, blur; the residuals' worth."""
+
+    h: F64
+    h_cov: F64
+    gamma: float
+    gamma_sigma: float
+    blur: float
+    explained: float  #: share of the squared residuals that the response explains in blocks that it was not fitted to
+
+
+@dataclass(frozen=True, eq=False)
+class _Equation:
+    """Residual r (n,), derivatives of the prediction by the unknowns (P, n), expected deviation (n,), blocks (n,)."""
+
+    r: F64
+    J: F64
+    sigma: F64
+    block: NDArray[np.int64]
+
+
+class _Unknowns:
+    """Where each unknown stands: gamma, blur squared, deltas, and one free constant per equation that has one."""
+
+    def __init__(self, pixels: Pixels, levels: tuple[float, float], s: ResponseSettings) -> None:
+        self.levels, self.free = levels, s.harmonics
+        self.head = 2 + self.free
+        self.size = self.head + 2 * len(pixels.pairs)
+        spread = np.full(self.size, 1e3)
+        spread[0], spread[1], spread[2 : self.head] = 3.0, s.expected_blur**2, s.law_tolerance
+        self.prior = 1 / spread**2
+        self.start = np.zeros(self.size)  # also the prior's middle: linear, sharp, no deviations
+        self.start[0] = 1.0
+
+    def harmonics(self, head: F64) -> F64:
+        """h_2 .. (ORDERS,) of sharp fringes drawn as they should be."""
+        h = model.gamma_harmonics(float(head[0]), self.levels)[:ORDERS].copy()
+        h[: self.free] += head[2:]
+        return h
+
+    def seen(self, head: F64, o: Observed) -> F64:
+        """h_2 .. of one set: as drawn, and blurred."""
+        h = model.redrawn(self.harmonics(head), o.exponent)
+        return model.attenuated(h, math.sqrt(max(float(head[1]), 0.0)), o.frequency)
+
+    def derivatives(self, head: F64, f: Callable[[F64], F64]) -> F64:
+        """(len(f), head) by differences."""
+        step = 1e-4
+        return np.stack([(f(head + step * e) - f(head - step * e)) / (2 * step) for e in np.eye(self.head)], axis=1)
+
+    def bounded(self, theta: F64) -> F64:
+        out = theta.copy()
+        out[0] = min(max(out[0], 0.2), 6.0)
+        out[1] = min(max(out[1], 0.0), 400.0)
+        out[2 : self.head] = np.clip(out[2 : self.head], -0.6, 0.6)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Set:
+    """One set's error at its pixels under the present response, with derivatives by the unknowns of the head."""
+
+    phi: F64  #: true phase
+    slope: F64  #: 1 + d(error) / d(phi)
+    log: model.C128  #: log(1 + x)
+    by: model.C128  #: (head, n) derivative of log(1 + x)
+
+
+def _set(h: F64, dh: F64, steps: int, phi: F64) -> _Set:
+    x, slope, by_h = model.excess(h, steps, phi)
+    used = np.flatnonzero(np.abs(by_h[:, :1]).ravel() > 0)
+    by = dh[used].T.astype(np.complex128) @ (by_h[used] / (1 + x))
+    return _Set(phi, 1 + np.imag(slope / (1 + x)), np.log(1 + x), by)
+
+
+def _true(h: F64, steps: int, phase: F64) -> F64:
+    """Measured phases (any number of turns) to true ones."""
+    add, _ = model.table(h, steps)
+    at = np.mod(phase * steps / (2 * np.pi), 1.0) * len(add)
+    return np.asarray(phase + np.interp(at, np.arange(len(add) + 1), np.append(add, add[0])))
+
+
+def _wrap(x: F64) -> F64:
+    return np.asarray(x - 2 * np.pi * np.rint(x / (2 * np.pi)))
+
+
+def disagreement(pair: Pair, sets: tuple[Observed, ...], h_other: F64 | None, h_fine: F64 | None) -> F64:
+    """By how much a pair's phases disagree, rad of the other set (n,), after correction by what each set shows."""
+    other, fine = sets[pair.other], sets[pair.fine]
+    a = other.phase if h_other is None else _true(h_other, other.steps, other.phase)
+    b = pair.fine_phase if h_fine is None else _true(h_fine, fine.steps, pair.fine_phase)
+    return _wrap(a - pair.ratio * b)
+
+
+def _pair_equations(n: int, pair: Pair, pixels: Pixels, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64, int]]:
+    """Phase, log modulation and background of a pair: residual, derivatives by the head, sigma, own constant or -1."""
+    o, f = pixels.sets[pair.other], pixels.sets[pair.fine]
+    h_o, h_f = u.seen(head, o), u.seen(head, f)
+    d_o, d_f = (u.derivatives(head, lambda t, x=x: u.seen(t, x)) for x in (o, f))
+    phi = _true(h_f, f.steps, pair.fine_phase)
+    F = _set(h_f, d_f, f.steps, phi)
+    O = _set(h_o, d_o, o.steps, pair.ratio * phi)
+    r = pair.ratio
+    moved = -F.by.imag / np.maximum(F.slope, 0.05)  # d(phi of the fine set) by the head
+    phase = _wrap(o.phase - O.phi - O.log.imag)
+    out = [(phase, O.by.imag + O.slope * r * moved, np.hypot(o.sigma, r * f.sigma), -1)]
+    log = np.log(o.modulation / f.modulation) - O.log.real + F.log.real
+    out.append((log, O.by.real - F.by.real, np.hypot(o.sigma, f.sigma), u.head + 2 * n))
+    B = np.sqrt(o.modulation * f.modulation)
+    level = (o.background - f.background) / B
+    by = np.zeros_like(out[0][1])
+    for x, h, d, sign, phi_x in ((o, h_o, d_o, 1.0, O.phi), (f, h_f, d_f, -1.0, F.phi)):
+        for i, order in model.folded(len(h), x.steps, 0):
+            if order > 0:
+                c = np.cos(order * phi_x)
+                level -= sign * h[i] * c
+                by += sign * d[i][:, None] * c
+    sigma = np.hypot(o.sigma, f.sigma) / math.sqrt(2)
+    out.append((level, by, sigma, u.head + 2 * n + 1))
+    return out
+
+
+def _bin_equations(o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64]]:
+    """Real and imaginary part of the bins beside the fringe, turned with the phase so that a harmonic stands still."""
+    h = u.seen(head, o)
+    d = u.derivatives(head, lambda t: u.seen(t, o))
+    phi = _true(h, o.steps, o.phase)
+    gain = np.abs(1 + model.excess(h, o.steps, phi)[0])
+    out = []
+    for row, m in enumerate(range(2, o.steps // 2 + 1)):
+        turn = np.exp(-1j * m * phi)
+        y, by = o.bins[row] * gain * turn, np.zeros((u.head, phi.size), np.complex128)
+        for i, order in model.folded(len(h), o.steps, m):
+            term = np.exp(1j * order * phi) * turn
+            y = y - h[i] * term
+            by += d[i][:, None] * term
+        sigma = o.sigma
+        out += [(y.real, by.real, sigma), (y.imag, by.imag, sigma)]
+    return out
+
+
+def _triple_equations(t: Triple, o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64]]:
+    """Second differences of the corrected phase and of the corrected log modulation: zero on what is smooth."""
+    h = u.seen(head, o)
+    d = u.derivatives(head, lambda x: u.seen(x, o))
+    sets = [_set(h, d, o.steps, _true(h, o.steps, p)) for p in t.phase]
+    a, b, c = sets
+    by = [x.by.imag / np.maximum(x.slope, 0.05) for x in sets]
+    bend = _wrap(c.phi - b.phi) - _wrap(b.phi - a.phi)
+    level = [m - x.log.real for m, x in zip(t.log_modulation, sets, strict=True)]
+    fall = level[2] - 2 * level[1] + level[0]
+    return [
+        (bend, by[2] - 2 * by[1] + by[0], 1.4 * t.sigma),
+        (fall, c.by.real - 2 * b.by.real + a.by.real, 1.4 * t.sigma),
+    ]
+
+
+def _equations(pixels: Pixels, u: _Unknowns, theta: F64) -> list[_Equation]:
+    head = theta[: u.head]
+    out: list[_Equation] = []
+
+    def add(r: F64, J: F64, sigma: F64, block: NDArray[np.int64], own: int = -1) -> None:
+        full = np.zeros((u.size, r.size))
+        full[: u.head] = J
+        if own >= 0:
+            full[own] = 1.0
+            r = r - theta[own]
+        out.append(_Equation(r, full, sigma, block))
+
+    for n, pair in enumerate(pixels.pairs):
+        for r, J, sigma, own in _pair_equations(n, pair, pixels, u, head):
+            add(r, J, sigma, pixels.block, own)
+    for o in pixels.sets:
+        if len(o.bins):
+            for r, J, sigma in _bin_equations(o, u, head):
+                add(r, J, sigma, pixels.block)
+    for t in pixels.triples:
+        for r, J, sigma in _triple_equations(t, pixels.sets[t.of], u, head):
+            add(r, J, sigma, t.block)
+    return out
+
+
+def _weights(r: F64, sigma: F64) -> F64:
+    """Tukey's, on the scale of the residuals themselves where they are larger than expected."""
+    scale = sigma * max(1.4826 * float(np.median(np.abs(r / sigma))), 1.0)
+    z = r / (TUKEY * scale)
+    return np.where(np.abs(z) < 1, (1 - z * z) ** 2, 0.0) / scale**2
+
+
+def _normal(
+    pixels: Pixels, u: _Unknowns, theta: F64, keep: Bool, effect: float
+) -> tuple[F64, F64, F64]:
+    """Normal matrix and right side of the blocks in `keep`, and each block's score (blocks, P)."""
+    blocks = len(keep)
+    H, score = np.zeros((u.size, u.size)), np.zeros((blocks, u.size))
+    for e in _equations(pixels, u, theta):
+        w = _weights(e.r, e.sigma) / effect * keep[e.block]
+        H += (e.J * w) @ e.J.T
+        pull = e.J * (w * e.r)
+        for p in range(u.size):
+            score[:, p] += np.bincount(e.block, pull[p], blocks)
+    return H, score.sum(0), score
+
+
+def _solve(pixels: Pixels, u: _Unknowns, keep: Bool, effect: float, theta: F64) -> F64:
+    for _ in range(ROUNDS):
+        H, g, _score = _normal(pixels, u, theta, keep, effect)
+        step = np.linalg.solve(H + np.diag(u.prior), g - u.prior * (theta - u.start))
+        largest = float(np.abs(step[: u.head]).max())
+        new = u.bounded(theta + step * min(1.0, 0.5 / max(largest, 1e-12)))
+        moved = float(np.abs(new - theta)[: u.head].max())
+        theta = new
+        if moved < 1e-5:
+            break
+    return theta
+
+
+def _squares(pixels: Pixels, u: _Unknowns, theta: F64, keep: Bool) -> float:
+    """Mean squared phase-like residual over the kept blocks, each clipped at where it would have no say."""
+    total, count = 0.0, 0.0
+    for e in _equations(pixels, u, theta):
+        inside = keep[e.block]
+        z = np.minimum((e.r[inside] / e.sigma[inside]) ** 2, 400.0)
+        total, count = total + float(z.sum()), count + z.size
+    return total / max(count, 1.0)
+
+
+def fit(pixels: Pixels, levels: tuple[float, float], s: ResponseSettings) -> Fit:
+    """The response of the pixels' capture, fringes drawn between `levels`; the caller made sure that there is evidence.
+    """
+    u = _Unknowns(pixels, levels, s)
+    blocks = int(max([pixels.block.max(), *(t.block.max() for t in pixels.triples)])) + 1
+    every = np.ones(blocks, bool)
+    theta, effect = u.start.copy(), 1.0
+    for _ in range(2):
+        theta = _solve(pixels, u, every, effect, theta)
+        H, _, score = _normal(pixels, u, theta, every, effect)
+        full = np.linalg.inv(H + np.diag(u.prior))
+        there = np.count_nonzero(np.abs(score).sum(1) > 0)
+        meat = score.T @ score * (there / max(there - 1, 1))
+        effect *= max(float(np.trace(full @ meat)) / max(float(np.trace(full @ H)), 1e-12), 1.0)
+    cov = full @ (meat + np.diag(u.prior)) @ full
+    head = theta[: u.head]
+    d = u.derivatives(head, u.harmonics)
+    h_cov = d @ cov[: u.head, : u.head] @ d.T
+    return Fit(
+        u.harmonics(head),
+        h_cov,
+        float(head[0]),
+        float(math.sqrt(max(cov[0, 0], 0.0))),
+        math.sqrt(max(float(head[1]), 0.0)),
+        _held_out(pixels, u, effect, blocks),
+    )
+
+
+def _held_out(pixels: Pixels, u: _Unknowns, effect: float, blocks: int) -> float:
+    """Fitted to every other block, how much of the other blocks' squared residuals goes away (share)."""
+    half = (np.arange(blocks) % 2).astype(bool)
+    theta = _solve(pixels, u, half, effect, u.start.copy())
+    linear = u.start.copy()
+    linear[u.head :] = theta[u.head :]
+    before, after = (_squares(pixels, u, t, ~half) for t in (linear, theta))
+    return 1 - after / max(before, 1e-12)
