@@ -7,7 +7,7 @@ sites: the phase does not depend on a site's colour, so no demosaicing ever mixe
 from fringescope.phase.measure import crop_rows, join_rows, measure, with_reasons
 from fringescope.phase.noise import estimate_noise
 from fringescope.phase.order import families, field_bounds, projector_coordinates, settle_order, unambiguous_span
-from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity
+from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, mean_picture
 
 __all__ = [
     "FringeSums",
@@ -19,6 +19,7 @@ __all__ = [
     "field_bounds",
     "intensity",
     "join_rows",
+    "mean_picture",
     "measure",
     "projector_coordinates",
     "settle_order",

@@ -10,7 +10,19 @@ import numpy as np
 
 from fringescope.errors import CaptureError
 from fringescope.kernels import fringes as k
-from fringescope.types import F32, F64, AnyArray, FringeSet, GrayCode, GraySet, NoiseModel, PixelFormat, Role
+from fringescope.types import (
+    F32,
+    F64,
+    AnyArray,
+    FrameKey,
+    FringeSet,
+    GrayCode,
+    GraySet,
+    NoiseModel,
+    PixelFormat,
+    Role,
+    ViewPlan,
+)
 
 
 def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
@@ -28,6 +40,15 @@ def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
     total: AnyArray = frame.astype(np.uint16).sum(axis=2, dtype=np.uint16)
     total[(frame >= pixel_format.max_value).any(axis=2)] = 3 * pixel_format.max_value
     return total
+
+
+def mean_picture(frames: Sequence[tuple[FrameKey, AnyArray]], plan: ViewPlan) -> F32:
+    """The mean (H, W) of all steps of all fringe sets, codes: the scene without fringes. All frames if there are none."""
+    steps = [f for key, f in frames if key.role is Role.STEP] or [f for _, f in frames]
+    mean = np.zeros(steps[0].shape[:2], np.float32)
+    for f in steps:
+        mean += intensity(f, plan.pixel_format)
+    return np.asarray(mean / np.float32(len(steps)))
 
 
 @dataclass(frozen=True, eq=False)
