@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from scipy.spatial import cKDTree
+
 from fringescope import geometry
 from fringescope.errors import EmptyResultError
 from fringescope.evaluate.statistics import plain
-from fringescope.types import F64, Board, Grid, Rig, Sighting
+from fringescope.types import F64, I32, Board, Grid, Rig, Sighting
 
 LEAST_POINTS = 24  #: surface points around a corner that give its depth
 LEAST_CORNERS = 8
@@ -91,9 +93,11 @@ def board_trueness(grids: Sequence[Grid], sightings: Sequence[Sighting], board: 
     for g in grids:
         if g.camera not in seen:
             continue
-        for place, index in zip(corners_in_space(g, seen[g.camera], rig), seen[g.camera].corner, strict=True):
+        places = corners_in_space(g, seen[g.camera], rig)
+        index = _numbered(places, seen[g.camera].corner, at, board)
+        for place, i in zip(places, index, strict=True):
             if np.isfinite(place).all():
-                at.setdefault((int(index[0]), int(index[1])), []).append(place)
+                at.setdefault((int(i[0]), int(i[1])), []).append(place)
     if len(at) < LEAST_CORNERS:
         raise EmptyResultError(f"{len(at)} corners of the board lie on measured surface; needed {LEAST_CORNERS}")
     index = np.array([k for k, v in at.items() for _ in v], dtype=np.int32)
@@ -117,6 +121,28 @@ def board_trueness(grids: Sequence[Grid], sightings: Sequence[Sighting], board: 
         1e6 * rms / spread,
         1e3 * float(np.median(apart)) if apart else None,
     )
+
+
+def _numbered(places: F64, index: I32, at: dict[tuple[int, int], list[F64]], board: Board) -> I32:
+    """The numbers of corners that lie at `places`, shifted or turned to agree with those that other views gave.
+
+    A view that sees part of a chequerboard, or one that looks the same after half a turn, numbers from another end.
+    """
+    if not at or not np.isfinite(places[:, 0]).any():
+        return index
+    known = np.array([v[0] for v in at.values()])
+    number = np.array(list(at), dtype=np.int32)
+    ok = np.isfinite(places[:, 0])
+    distance, nearest = cKDTree(known).query(places[ok])
+    near = distance < board.square_mm / 3
+    if not near.any():
+        return index
+    best, votes = index, -1
+    for turned in (index, -index):
+        shifts, counts = np.unique(number[nearest[near]] - turned[ok][near], axis=0, return_counts=True)
+        if counts.max() > votes:
+            best, votes = turned + shifts[np.argmax(counts)], int(counts.max())
+    return best.astype(np.int32)
 
 
 def _similarity(a: F64, b: F64) -> tuple[F64, F64, float]:
