@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from scipy.spatial import cKDTree
 
 from fringescope import geometry

@@ -43,7 +43,7 @@ def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
 
 
 def mean_picture(frames: Sequence[tuple[FrameKey, AnyArray]], plan: ViewPlan) -> F32:
-    """The mean (H, W) of all steps of all fringe sets, codes: the scene without fringes. All frames if there are none."""
+    """The mean (H, W) of all steps of all fringe sets, codes: the scene without fringes (all frames if none)."""
     steps = [f for key, f in frames if key.role is Role.STEP] or [f for _, f in frames]
     mean = np.zeros(steps[0].shape[:2], np.float32)
     for f in steps:
