@@ -148,6 +148,18 @@ class BoardSettings(_Section):
 
     edge_clearance: float = knob(0.2, "squares", "samples of the projector's phase stay this far from the edges of their white square", "III-B", 0.02, 0.45)
     max_samples: int = knob(4000, "", "samples of the projector's phase per picture at most, spread over all white squares", "III-B", 50)
+    corner_reach: float = knob(0.44, "squares", "half side of the window in which a corner is fitted", "III-B", 0.15, 0.48)
+    corner_radius: float = knob(60.0, "pixels", "the window is no larger than this", "III-B", 5, 500)
+    corner_misfit: float = knob(0.04, "", "a corner whose picture misses the fitted one by more than this share of its contrast is left out", "III-B", 0)
+    corner_misfit_factor: float = knob(4.0, "", "or by more than this times what is usual in the picture, if that is more", "III-B", 1)
+    corner_outlier: float = knob(8.0, "", "a corner that misses the smooth lattice by more than this times the usual is left out", "III-B", 2)
+    corner_saturated: float = knob(0.3, "", "a corner with more than this share of saturated pixels around it is left out", "III-B", 0, 1)
+    max_blur: float = knob(0.18, "squares", "a picture with softer edges (standard deviation) is refused", "III-B", 0.01, 0.5)
+    edge_pixels: float = knob(2.5, "pixels", "samples of the projector's phase stay at least this far, plus the blur, from any edge", "III-B", 1)
+    min_square_pixels: int = knob(25, "pixels", "a white square with fewer usable pixels has no centre", "III-B", 6)
+    phase_outlier: float = knob(4.0, "sigma", "a phase that misses its square's smooth fit by more than this is left out", "III-B", 1)
+    phase_rough: float = knob(4.0, "", "a square whose phase scatters by more than this times what is usual in the picture is left out", "III-B", 1)
+    min_share: float = knob(0.35, "", "pixels whose modulation is less than this share of their square's median are left out", "III-B", 0, 1)
 
 
 @dataclass(frozen=True)
