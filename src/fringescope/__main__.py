@@ -1,0 +1,5 @@
+"""`python -m fringescope`: the command line."""
+
+from fringescope.cli import main
+
+main()
