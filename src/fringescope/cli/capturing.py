@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -64,6 +65,28 @@ def simulate_into(folder: Path, world: World, plan: PatternPlan, s: Settings, pr
     truth.write(world.scene, rig, folder / "truth")
 
 
+def simulate_session(folder: Path, poses: int, make: Callable[[int], World], s: Settings, progress: Progress) -> None:
+    """A calibration session: a capture per pose of the board, board.json, the truth of all poses together."""
+    from fringescope import store
+    from fringescope.store import files
+
+    truth = []
+    for pose in range(poses):
+        world = make(pose)
+        here = folder / f"pose{pose:02d}"
+        here.mkdir()
+        progress("poses", pose, poses)
+        simulate_into(here, world, make_plan(world, s), s, Progress())
+        truth += world.scene.truth["poses.json"]
+        if pose == 0:
+            (folder / "truth").mkdir()
+            (here / "truth" / "rig.json").rename(folder / "truth" / "rig.json")
+            store.write_json(folder / files.BOARD, world.scene.truth["board.json"])
+        shutil.rmtree(here / "truth")
+    store.write_json(folder / "truth" / "poses.json", truth)
+    progress("poses", poses, poses)
+
+
 def make_world(scene: str, preset: str, scale: float, seed: int, layout: str, pose: int, board: str) -> World:
     """A simulated instrument over a scene. Raises UsageError."""
     from fringescope.devices import simulated
@@ -74,7 +97,8 @@ def make_world(scene: str, preset: str, scale: float, seed: int, layout: str, po
     if layout not in ("grid", "diamond"):
         raise UsageError(f"--layout {layout}; needed grid or diamond")
     instrument = presets.instrument(preset, scale, Layout(layout))
-    return simulated.World(scenes.make(scene, seed, pose=pose, board=board), instrument, seed)
+    noise_seed = seed + 1_000_003 * pose  # the poses of a session share no noise
+    return simulated.World(scenes.make(scene, seed, pose=pose, board=board), instrument, noise_seed)
 
 
 def make_plan(world: World, s: Settings) -> PatternPlan:
@@ -100,6 +124,9 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Of the scene and all noise.", min=0)] = 0,
     layout: Annotated[str, typer.Option(help="Projector lattice: diamond or grid.")] = "diamond",
     pose: Annotated[int, typer.Option(help="Which pose of the board.", min=0)] = 0,
+    poses: Annotated[
+        int, typer.Option(help="Of the board: a whole calibration session of so many poses.", min=0, max=100)
+    ] = 0,
     board: Annotated[str, typer.Option(help="checkerboard or charuco.")] = "checkerboard",
     settings: SettingsFile = None,
     set_: SetOption = None,
@@ -110,6 +137,18 @@ def simulate(
     from fringescope import store
 
     s = load_settings(settings, set_)
+    if poses:
+        if scene != "board":
+            raise UsageError(f"--poses {poses} of {scene}; a session shows a board: simulate board --poses {poses}")
+
+        def make(number: int) -> World:
+            return make_world(scene, preset, scale, seed, layout, number, board)
+
+        with Progress() as progress, store.new_folder(out, marker="board.json", force=force) as tmp:
+            simulate_session(tmp, poses, make, s, progress)
+        told = {"session": str(out), "rig": str(out / "truth" / "rig.json"), "scene": scene, "poses": poses}
+        emit(told, json, [f"{out}: a session of {poses} poses", f"rig: {out / 'truth' / 'rig.json'}"])
+        return
     with Progress() as progress, store.new_folder(out, marker="capture.json", force=force) as tmp:
         world = make_world(scene, preset, scale, seed, layout, pose, board)
         simulate_into(tmp, world, make_plan(world, s), s, progress)

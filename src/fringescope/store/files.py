@@ -19,7 +19,7 @@ from typing import Any
 
 from fringescope.errors import FormatError, OutputError
 
-CAPTURE, SCAN, DECODED, PLAN = "capture.json", "scan.json", "decoded.json", "plan.json"
+CAPTURE, SCAN, DECODED, PLAN, BOARD = "capture.json", "scan.json", "decoded.json", "plan.json", "board.json"
 
 _REASONS = {
     errno.ENOSPC: "the disk is full",
@@ -221,8 +221,8 @@ def shown(value: object, length: int = 60) -> str:
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
-def write_json(path: Path, doc: Mapping[str, Any]) -> None:
-    """A JSON object as text, into a folder that is being made. Numbers must be finite."""
+def write_json(path: Path, doc: Mapping[str, Any] | list[Any]) -> None:
+    """A JSON object or array as text, into a folder that is being made. Numbers must be finite."""
     path.write_text(json.dumps(doc, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 

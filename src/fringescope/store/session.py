@@ -19,7 +19,6 @@ from fringescope.store.capture import Capture, read_capture
 from fringescope.store.rig import explain
 from fringescope.types import AnyArray, Board, Calibration, Sighting
 
-BOARD = "board.json"
 OBSERVATIONS = "fringescope-observations"
 MOST_BYTES = 1 << 30  #: no stored array is larger
 
@@ -92,11 +91,11 @@ def read_session(path: Path | str, board: Board | None = None) -> Session:
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise FormatError(f"{folder}: no such folder; needed a session: {BOARD} and a capture per pose (pose00/, ..)")
-    if board is None and not (folder / BOARD).exists():
-        raise FormatError(f"{folder}: no {BOARD} in it; it tells the squares, such as "
+        raise FormatError(f"{folder}: no such folder; needed {files.BOARD} and a capture per pose (pose00/, ..)")
+    if board is None and not (folder / files.BOARD).exists():
+        raise FormatError(f"{folder}: no {files.BOARD} in it; it tells the squares, such as "
                           '{"pattern": "checkerboard", "inner_corners": [11, 8], "square_mm": 5.0}')  # fmt: skip
-    board = board or read_board(folder / BOARD)
+    board = board or read_board(folder / files.BOARD)
     names = sorted(p.name for p in folder.iterdir() if (p / files.CAPTURE).is_file())
     if not names:
         raise FormatError(f"{folder}: no captures in it; needed a folder with {files.CAPTURE} per pose (pose00/, ..)")
