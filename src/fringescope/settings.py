@@ -218,7 +218,7 @@ class ResponseSettings(_Section):
     max_sigma_rad: float = knob(0.15, "rad", "pixels whose phase is noisier than this tell nothing of the response", "", 0.001)
     min_contrast: float = knob(0.1, "", "least modulation, as a share of the background, of pixels that tell of the response", "", 0, 1)
     min_pixels: int = knob(400, "pixels", "fewest pixels that tell of the response", "", 50)
-    max_pixels: int = knob(40_000, "pixels", "pixels that are looked at; more do not make it better", "", 1000)
+    max_pixels: int = knob(20_000, "pixels", "pixels that are looked at; more do not make it better", "", 1000)
     max_saturated: float = knob(0.02, "", "share of the lit pixels that may saturate before it is said so", "", 0, 1)
 
 

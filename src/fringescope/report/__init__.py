@@ -1,5 +1,6 @@
 """Pictures for people: error maps, reasons, rendered clouds and surfaces, contact sheets."""
 
+from fringescope.report.calibration import calibration_page
 from fringescope.report.figures import (
     REASON_COLOURS,
     Panel,
@@ -12,6 +13,8 @@ from fringescope.report.figures import (
     reasons_picture,
 )
 from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_cloud, render_surface
+from fringescope.report.sighting import sighting_picture
+from fringescope.report.response import RippleCurve, response_picture
 from fringescope.report.story import VIEWPOINTS, around, story
 
 __all__ = [
@@ -21,9 +24,11 @@ __all__ = [
     "WHITE",
     "Light",
     "Panel",
+    "RippleCurve",
     "Viewpoint",
     "around",
     "bin_map",
+    "calibration_page",
     "contact_sheet",
     "error_map",
     "fringe_picture",
@@ -32,5 +37,7 @@ __all__ = [
     "reasons_picture",
     "render_cloud",
     "render_surface",
+    "sighting_picture",
+    "response_picture",
     "story",
 ]

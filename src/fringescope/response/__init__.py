@@ -9,6 +9,7 @@ from fringescope.response.model import (
     correct,
     corrected,
     curve,
+    drawn_to_power,
     gamma_harmonics,
     greatest_error,
     harmonics_at,
@@ -18,12 +19,15 @@ from fringescope.response.model import (
     predistortion,
     table,
 )
+from fringescope.response.ripple import Ripple, plane_ripple
 from fringescope.response.staircase import from_staircase
 
 __all__ = [
+    "Ripple",
     "correct",
     "corrected",
     "curve",
+    "drawn_to_power",
     "from_exponents",
     "from_fringes",
     "from_sets",
@@ -33,6 +37,7 @@ __all__ = [
     "harmonics_at",
     "inverse_curve",
     "phase_error",
+    "plane_ripple",
     "predicted_errors",
     "predistortion",
     "table",

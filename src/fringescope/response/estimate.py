@@ -27,12 +27,15 @@ from fringescope.types import F64, Bool
 
 ORDERS = 11  #: harmonics h_2 .. h_12 that the equations hold
 ROUNDS = 20
+GRID = 2048  #: entries of a table over one ripple
+CONVERGED = 3e-5  #: change of a harmonic
+EFFECT = 30.0  #: by how much alike neighbouring pixels are at first taken to be
 TUKEY = 4.685  #: residuals beyond this many robust deviations have no say
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found: harmonics h_2 .. (ORDERS,) of sharp fringes with covariance, gamma, blur; the residuals' worth."""
+    """What was found: harmonics h_2 .. (ORDERS,) of sharp fringes with covariance, gamma, blur."""
 
     h: F64
     h_cov: F64
@@ -95,19 +98,39 @@ class _Set:
 
     phi: F64  #: true phase
     slope: F64  #: 1 + d(error) / d(phi)
-    log: model.C128  #: log(1 + x)
-    by: model.C128  #: (head, n) derivative of log(1 + x)
+    gain: F64  #: Re log(1 + x), what the modulation grows by
+    error: F64  #: Im log(1 + x), the phase error
+    gain_by: F64  #: (head, n) derivatives
+    error_by: F64
 
 
-def _set(h: F64, dh: F64, steps: int, phi: F64) -> _Set:
-    x, slope, by_h = model.excess(h, steps, phi)
-    used = np.flatnonzero(np.abs(by_h[:, :1]).ravel() > 0)
-    by = dh[used].T.astype(np.complex128) @ (by_h[used] / (1 + x))
-    return _Set(phi, 1 + np.imag(slope / (1 + x)), np.log(1 + x), by)
+class _Ripple:
+    """A set's error as a table over one ripple, read at any number of phases."""
+
+    def __init__(self, u: _Unknowns, head: F64, o: Observed) -> None:
+        self.h, self.steps = u.seen(head, o), o.steps
+        self.dh = u.derivatives(head, lambda t: u.seen(t, o))
+        phi: F64 = np.arange(GRID + 1) * (2 * math.pi / (o.steps * GRID))
+        x, slope, used, by_h = model.excess(self.h, o.steps, phi)
+        log, by = np.log(1 + x), self.dh[used].T @ (by_h / (1 + x))
+        self._rows = np.concatenate([[1 + np.imag(slope / (1 + x))], [log.real], [log.imag], by.real, by.imag])
+
+    def true(self, measured: F64) -> F64:
+        """Measured phases (any number of turns) to true ones."""
+        return _true(self.h, self.steps, measured)
+
+    def at(self, phi: F64) -> _Set:
+        """The error at true phases (n,)."""
+        x = phi * (self.steps / (2 * math.pi))
+        x = (x - np.floor(x)) * GRID
+        k = np.minimum(x.astype(np.int64), GRID - 1)
+        f = x - k
+        rows = self._rows[:, k] * (1 - f) + self._rows[:, k + 1] * f
+        n = self.dh.shape[1]
+        return _Set(phi, rows[0], rows[1], rows[2], rows[3 : 3 + n], rows[3 + n :])
 
 
 def _true(h: F64, steps: int, phase: F64) -> F64:
-    """Measured phases (any number of turns) to true ones."""
     add, _ = model.table(h, steps)
     at = np.mod(phase * steps / (2 * np.pi), 1.0) * len(add)
     return np.asarray(phase + np.interp(at, np.arange(len(add) + 1), np.append(add, add[0])))
@@ -128,63 +151,57 @@ def disagreement(pair: Pair, sets: tuple[Observed, ...], h_other: F64 | None, h_
 def _pair_equations(n: int, pair: Pair, pixels: Pixels, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64, int]]:
     """Phase, log modulation and background of a pair: residual, derivatives by the head, sigma, own constant or -1."""
     o, f = pixels.sets[pair.other], pixels.sets[pair.fine]
-    h_o, h_f = u.seen(head, o), u.seen(head, f)
-    d_o, d_f = (u.derivatives(head, lambda t, x=x: u.seen(t, x)) for x in (o, f))
-    phi = _true(h_f, f.steps, pair.fine_phase)
-    F = _set(h_f, d_f, f.steps, phi)
-    O = _set(h_o, d_o, o.steps, pair.ratio * phi)
+    of, ff = _Ripple(u, head, o), _Ripple(u, head, f)
+    fine = ff.at(ff.true(pair.fine_phase))
+    other = of.at(pair.ratio * fine.phi)
     r = pair.ratio
-    moved = -F.by.imag / np.maximum(F.slope, 0.05)  # d(phi of the fine set) by the head
-    phase = _wrap(o.phase - O.phi - O.log.imag)
-    out = [(phase, O.by.imag + O.slope * r * moved, np.hypot(o.sigma, r * f.sigma), -1)]
-    log = np.log(o.modulation / f.modulation) - O.log.real + F.log.real
-    out.append((log, O.by.real - F.by.real, np.hypot(o.sigma, f.sigma), u.head + 2 * n))
-    B = np.sqrt(o.modulation * f.modulation)
-    level = (o.background - f.background) / B
-    by = np.zeros_like(out[0][1])
-    for x, h, d, sign, phi_x in ((o, h_o, d_o, 1.0, O.phi), (f, h_f, d_f, -1.0, F.phi)):
-        for i, order in model.folded(len(h), x.steps, 0):
+    moved = -fine.error_by / np.maximum(fine.slope, 0.05)  # d(phi of the fine set) by the head
+    phase = _wrap(o.phase - other.phi - other.error)
+    J = other.error_by + other.slope * r * moved
+    log = np.log(o.modulation / f.modulation) - other.gain + fine.gain
+    level = (o.background - f.background) / np.sqrt(o.modulation * f.modulation)
+    by = np.zeros_like(J)
+    for x, ripple, sign, phi in ((o, of, 1.0, other.phi), (f, ff, -1.0, fine.phi)):
+        for i, order in model.folded(len(ripple.h), x.steps, 0):
             if order > 0:
-                c = np.cos(order * phi_x)
-                level -= sign * h[i] * c
-                by += sign * d[i][:, None] * c
-    sigma = np.hypot(o.sigma, f.sigma) / math.sqrt(2)
-    out.append((level, by, sigma, u.head + 2 * n + 1))
-    return out
+                c = np.cos(order * phi)
+                level -= sign * ripple.h[i] * c
+                by += sign * ripple.dh[i][:, None] * c
+    both = np.hypot(o.sigma, f.sigma)
+    return [
+        (phase, J, np.hypot(o.sigma, r * f.sigma), -1),
+        (log, other.gain_by - fine.gain_by, both, u.head + 2 * n),
+        (level, by, both / math.sqrt(2), u.head + 2 * n + 1),
+    ]
 
 
 def _bin_equations(o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64]]:
     """Real and imaginary part of the bins beside the fringe, turned with the phase so that a harmonic stands still."""
-    h = u.seen(head, o)
-    d = u.derivatives(head, lambda t: u.seen(t, o))
-    phi = _true(h, o.steps, o.phase)
-    gain = np.abs(1 + model.excess(h, o.steps, phi)[0])
+    ripple = _Ripple(u, head, o)
+    phi = ripple.true(o.phase)
+    gain = np.exp(ripple.at(phi).gain)
     out = []
     for row, m in enumerate(range(2, o.steps // 2 + 1)):
         turn = np.exp(-1j * m * phi)
         y, by = o.bins[row] * gain * turn, np.zeros((u.head, phi.size), np.complex128)
-        for i, order in model.folded(len(h), o.steps, m):
+        for i, order in model.folded(len(ripple.h), o.steps, m):
             term = np.exp(1j * order * phi) * turn
-            y = y - h[i] * term
-            by += d[i][:, None] * term
-        sigma = o.sigma
-        out += [(y.real, by.real, sigma), (y.imag, by.imag, sigma)]
+            y = y - ripple.h[i] * term
+            by += ripple.dh[i][:, None] * term
+        out += [(y.real, by.real, o.sigma), (y.imag, by.imag, o.sigma)]
     return out
 
 
 def _triple_equations(t: Triple, o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64]]:
     """Second differences of the corrected phase and of the corrected log modulation: zero on what is smooth."""
-    h = u.seen(head, o)
-    d = u.derivatives(head, lambda x: u.seen(x, o))
-    sets = [_set(h, d, o.steps, _true(h, o.steps, p)) for p in t.phase]
-    a, b, c = sets
-    by = [x.by.imag / np.maximum(x.slope, 0.05) for x in sets]
+    ripple = _Ripple(u, head, o)
+    a, b, c = sets = [ripple.at(ripple.true(p)) for p in t.phase]
+    by = [x.error_by / np.maximum(x.slope, 0.05) for x in sets]
     bend = _wrap(c.phi - b.phi) - _wrap(b.phi - a.phi)
-    level = [m - x.log.real for m, x in zip(t.log_modulation, sets, strict=True)]
-    fall = level[2] - 2 * level[1] + level[0]
+    level = [m - x.gain for m, x in zip(t.log_modulation, sets, strict=True)]
     return [
         (bend, by[2] - 2 * by[1] + by[0], 1.4 * t.sigma),
-        (fall, c.by.real - 2 * b.by.real + a.by.real, 1.4 * t.sigma),
+        (level[2] - 2 * level[1] + level[0], c.gain_by - 2 * b.gain_by + a.gain_by, 1.4 * t.sigma),
     ]
 
 
@@ -236,14 +253,14 @@ def _normal(
 
 
 def _solve(pixels: Pixels, u: _Unknowns, keep: Bool, effect: float, theta: F64) -> F64:
+    h = u.harmonics(theta[: u.head])
     for _ in range(ROUNDS):
         H, g, _score = _normal(pixels, u, theta, keep, effect)
         step = np.linalg.solve(H + np.diag(u.prior), g - u.prior * (theta - u.start))
         largest = float(np.abs(step[: u.head]).max())
-        new = u.bounded(theta + step * min(1.0, 0.5 / max(largest, 1e-12)))
-        moved = float(np.abs(new - theta)[: u.head].max())
-        theta = new
-        if moved < 1e-5:
+        theta = u.bounded(theta + step * min(1.0, 0.5 / max(largest, 1e-12)))
+        before, h = h, u.harmonics(theta[: u.head])
+        if float(np.abs(h - before).max()) < CONVERGED:
             break
     return theta
 
@@ -264,14 +281,14 @@ def fit(pixels: Pixels, levels: tuple[float, float], s: ResponseSettings) -> Fit
     u = _Unknowns(pixels, levels, s)
     blocks = int(max([pixels.block.max(), *(t.block.max() for t in pixels.triples)])) + 1
     every = np.ones(blocks, bool)
-    theta, effect = u.start.copy(), 1.0
+    theta, effect = u.start.copy(), EFFECT
     for _ in range(2):
         theta = _solve(pixels, u, every, effect, theta)
         H, _, score = _normal(pixels, u, theta, every, effect)
         full = np.linalg.inv(H + np.diag(u.prior))
-        there = np.count_nonzero(np.abs(score).sum(1) > 0)
+        there = int((np.abs(score).sum(1) > 0).sum())
         meat = score.T @ score * (there / max(there - 1, 1))
-        effect *= max(float(np.trace(full @ meat)) / max(float(np.trace(full @ H)), 1e-12), 1.0)
+        effect = max(effect * float(np.trace(full @ meat)) / max(float(np.trace(full @ H)), 1e-12), 1.0)
     cov = full @ (meat + np.diag(u.prior)) @ full
     head = theta[: u.head]
     d = u.derivatives(head, u.harmonics)
@@ -282,14 +299,14 @@ def fit(pixels: Pixels, levels: tuple[float, float], s: ResponseSettings) -> Fit
         float(head[0]),
         float(math.sqrt(max(cov[0, 0], 0.0))),
         math.sqrt(max(float(head[1]), 0.0)),
-        _held_out(pixels, u, effect, blocks),
+        _held_out(pixels, u, effect, blocks, theta),
     )
 
 
-def _held_out(pixels: Pixels, u: _Unknowns, effect: float, blocks: int) -> float:
+def _held_out(pixels: Pixels, u: _Unknowns, effect: float, blocks: int, start: F64) -> float:
     """Fitted to every other block, how much of the other blocks' squared residuals goes away (share)."""
     half = (np.arange(blocks) % 2).astype(bool)
-    theta = _solve(pixels, u, half, effect, u.start.copy())
+    theta = _solve(pixels, u, half, effect, start)
     linear = u.start.copy()
     linear[u.head :] = theta[u.head :]
     before, after = (_squares(pixels, u, t, ~half) for t in (linear, theta))

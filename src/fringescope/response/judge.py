@@ -8,16 +8,18 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fringescope.errors import EmptyResultError, UsageError
 from fringescope.response import model
 from fringescope.response.estimate import Fit, disagreement, fit
 from fringescope.response.observe import Observed, Pixels, observe, read_bins
 from fringescope.settings import ResponseSettings
-from fringescope.types import F64, AnyArray, Decoded, FrameKey, Response, ViewPlan
+from fringescope.types import F64, AnyArray, Decoded, FrameKey, FringeSet, Response, ViewPlan
 
 STEPS = (3, 4, 5, 8)  #: what errors are predicted for
 LEVELS = (0.0, 1.0)
+BINS = 48  #: of the phase, in curves
 FLAT = 0.3  #: slope of the bright end over that of the middle, relative to the power law's, below which it saturates
 
 
@@ -52,7 +54,9 @@ def from_fringes(
 def from_exponents(
     decoded: Decoded, exponents: Sequence[float], s: ResponseSettings, levels: tuple[float, float] = LEVELS
 ) -> Response:
-    """The response from sets of one frequency whose fringes were drawn to known powers: `((1 + cos) / 2) ** exponent`.
+    """The response from sets of one frequency whose fringes were drawn to known powers.
+
+    They are `((1 + cos) / 2) ** exponent` and shown on something white and smooth.
 
     One exponent per set of `decoded`. Raises UsageError for another number of exponents, or if they do not differ
     within any direction; EmptyResultError as `from_sets`.
@@ -61,11 +65,11 @@ def from_exponents(
         raise UsageError(f"exponents {list(exponents)}; needed one of 0.05 to 20 for each of {len(decoded.sets)} sets")
     if len(set(exponents)) < 2:
         raise UsageError(f"exponents {list(exponents)} are all the same; needed two drawings that differ")
-    return _conclude(observe(decoded, s, exponents), s, levels, "exponents")
+    return _conclude(observe(decoded, s, exponents, smooth=True), s, levels, "exponents")
 
 
-def _fringe_sets(plan: ViewPlan) -> list[Any]:
-    return [x for x in plan.sets if hasattr(x, "steps")]
+def _fringe_sets(plan: ViewPlan) -> list[FringeSet]:
+    return [x for x in plan.sets if isinstance(x, FringeSet)]
 
 
 # ------------------------------------------------------------------------------------------------------------- verdict
@@ -78,16 +82,14 @@ def _conclude(pixels: Pixels, s: ResponseSettings, levels: tuple[float, float], 
             "period, or take five steps or more"
         )
     found = fit(pixels, levels, s)
-    kept = _kept(found)
-    h = found.h[:kept]
     errors = {n: _error(found, n, 0.0) for n in STEPS}
     sets = {o.steps: _error(found, o.steps, o.frequency) for o in sorted(pixels.sets, key=lambda o: o.frequency)}
     response = Response(
         source,
         found.gamma,
         found.gamma_sigma,
-        tuple(float(x) for x in h),
-        tuple(math.sqrt(max(float(x), 0.0)) for x in np.diag(found.h_cov)[:kept]),
+        tuple(float(x) for x in found.h),
+        tuple(math.sqrt(max(float(x), 0.0)) for x in np.diag(found.h_cov)),
         found.blur,
         levels,
         {n: e for n, (e, _) in errors.items()},
@@ -103,11 +105,7 @@ def _conclude(pixels: Pixels, s: ResponseSettings, levels: tuple[float, float], 
         "smooth_surface_assumed": bool(pixels.triples),
     }
     response = replace(response, needed=needed, figures=figures)
-    return replace(response, words=tuple(_words(response, sets, s)))
-
-
-def _kept(found: Fit) -> int:
-    return len(found.h)
+    return replace(response, words=tuple(words(response, sets, s)))
 
 
 def _measures(o: Observed, sets: Sequence[Observed]) -> bool:
@@ -137,43 +135,53 @@ def _needs(found: Fit, o: Observed, measures: bool, s: ResponseSettings) -> bool
 
 
 def _pairs_figures(pixels: Pixels, response: Response) -> Iterable[Mapping[str, Any]]:
+    """By how much sets that must agree disagree, before and after: median in plane units, mean over the phase in rad.
+    """
+    sharp = np.asarray(response.harmonics)
     for p in pixels.pairs:
         o, f = pixels.sets[p.other], pixels.sets[p.fine]
-        if o.exponent != f.exponent:
-            h = [
-                model.attenuated(model.redrawn(np.asarray(response.harmonics), x.exponent), response.blur, x.frequency)
-                for x in (o, f)
-            ]
-        else:
-            h = [model.harmonics_at(response, x.frequency) for x in (o, f)]
+        h = [model.attenuated(model.redrawn(sharp, x.exponent), response.blur, x.frequency) for x in (o, f)]
+        before = disagreement(p, pixels.sets, None, None)
+        after = disagreement(p, pixels.sets, *h)
+        bins = np.minimum(((o.phase + math.pi) / (2 * math.pi) * BINS).astype(np.int64), BINS - 1)
         unit = 1 / (2 * math.pi * o.frequency)
-        before = np.abs(disagreement(p, pixels.sets, None, None)) * unit
-        after = np.abs(disagreement(p, pixels.sets, *h)) * unit
         yield {
             "periods": [1 / o.frequency, 1 / f.frequency],
             "steps": [o.steps, f.steps],
-            "median_before": float(np.median(before)),
-            "median_after": float(np.median(after)),
+            "median_before": float(np.median(np.abs(before))) * unit,
+            "median_after": float(np.median(np.abs(after))) * unit,
+            "phase": ((np.arange(BINS) + 0.5) * 2 * math.pi / BINS - math.pi).tolist(),
+            "before": _binned(bins, before),
+            "after": _binned(bins, after),
         }
 
 
-def _words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSettings) -> Iterable[str]:
-    yield f"gamma {r.gamma:.3f} +- {r.gamma_sigma:.3f}, second harmonic {100 * r.harmonics[0]:.1f} % of the fringe"
+def _binned(bins: NDArray[np.int64], value: F64) -> list[float | None]:
+    """Median per bin; None where a bin is empty."""
+    return [float(np.median(value[bins == b])) if (bins == b).any() else None for b in range(BINS)]
+
+
+def words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSettings) -> Iterable[str]:
+    """The verdict in plain words; `sets`: phase error and its sigma by number of steps, the finest last."""
+    yield (
+        f"gamma {r.gamma:.3f} +- {r.gamma_sigma:.3f}; the second harmonic is {100 * r.harmonics[0]:.2f} +- "
+        f"{100 * r.sigmas[0]:.2f} % of the fringe"
+    )
     told = ", ".join(f"{e:.4f} +- {d:.4f} rad at N = {n}" for n, (e, d) in sets.items())
     worst, sigma = max(sets.values())
-    others = [n for n, e in r.error_rad.items() if e < s.negligible_rad]
+    fair = [n for n, e in r.error_rad.items() if e < s.negligible_rad]
     if r.needed:
-        yield f"needs correction: {told}: give this file to reconstruct and decode with --response"
-        more = f", or {min(others)} steps ({r.error_rad[min(others)]:.4f} rad)" if others else ""
-        yield f"or do without: draw the patterns through the table `predistortion`{more}"
+        yield f"needs correction: {told}; give this response to reconstruct and decode"
+        more = f", or take {min(fair)} steps ({r.error_rad[min(fair)]:.4f} rad)" if fair else ""
+        yield f"or do without: draw the patterns through the table 'predistortion'{more}"
     elif worst > s.negligible_rad and worst <= s.significance * sigma:
-        yield f"nothing is proved: {told}: no correction; more light, or a larger and plainer surface, would tell"
+        yield f"nothing is proved: {told}; more light, or a larger and plainer surface, would tell"
     else:
         yield f"needs no correction: {told}"
     if r.saturated > s.max_saturated:
         yield f"{100 * r.saturated:.0f} % of what is lit saturates: halve the exposure"
-    if flat_end(r) < FLAT:
-        yield "the bright end of the response is flat: projector or camera saturates there: halve the exposure or lower level_high"
+    if flat_end(r) < FLAT and r.needed:
+        yield "the bright end is flat: projector or camera saturates: halve the exposure, or draw less bright"
 
 
 def flat_end(r: Response) -> float:

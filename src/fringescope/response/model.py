@@ -22,24 +22,20 @@ TERMS = 24  #: harmonics that a power law is expanded to
 NODES = 512  #: samples of a curve for its expansion
 TABLE = 1024  #: entries of a correction table over one ripple
 C128 = NDArray[np.complex128]
+_THETA: F64 = (np.arange(NODES) + 0.5) * np.pi / NODES
+_BASIS: F64 = np.cos(np.arange(TERMS + 1)[:, None] * _THETA) * (2 / NODES)
 
 
 def expand(curve: ArrayLike) -> F64:
     """Chebyshev coefficients a_0 .. a_TERMS of a curve given at `nodes()`."""
-    theta = _theta()
-    y = np.asarray(curve, dtype=np.float64)
-    a = 2 * np.mean(y * np.cos(np.arange(TERMS + 1)[:, None] * theta), axis=1)
+    a: F64 = _BASIS @ np.asarray(curve, dtype=np.float64)
     a[0] /= 2
     return a
 
 
-def _theta() -> F64:
-    return np.asarray((np.arange(NODES) + 0.5) * np.pi / NODES)
-
-
 def nodes() -> F64:
     """Levels asked, 0..1, at which `expand` wants a curve."""
-    return np.asarray(0.5 + 0.5 * np.cos(_theta()))
+    return np.asarray(0.5 + 0.5 * np.cos(_THETA))
 
 
 def gamma_harmonics(gamma: float, levels: tuple[float, float] = (0.0, 1.0), exponent: float = 1.0) -> F64:
@@ -85,15 +81,19 @@ def folded(count: int, steps: int, m: int) -> list[tuple[int, int]]:
     return out
 
 
-def excess(h: F64, steps: int, phi: F64) -> tuple[C128, C128, C128]:
-    """x(phi) of the module's docstring, its derivative by phi, and (len(h), n) its derivatives by h."""
-    by_h = np.zeros((len(h), phi.size), np.complex128)
+def excess(h: F64, steps: int, phi: F64) -> tuple[C128, C128, list[int], C128]:
+    """x(phi) of the module's docstring and its derivative by phi (n,); which h (h_2 ..) it holds, and its derivatives
+    by these (used, n).
+    """
+    fold = folded(len(h), steps, 1)
+    used = sorted({i for i, _ in fold})
+    by_h = np.zeros((len(used), phi.size), np.complex128)
     slope = np.zeros(phi.size, np.complex128)
-    for i, order in folded(len(h), steps, 1):
+    for i, order in fold:
         term = np.exp(1j * (order - 1) * phi)
-        by_h[i] += term
+        by_h[used.index(i)] += term
         slope += h[i] * 1j * (order - 1) * term
-    return np.asarray(h @ by_h), slope, by_h
+    return np.asarray(h[used] @ by_h), slope, used, by_h
 
 
 def phase_error(h: F64, steps: int, phi: F64) -> F64:
@@ -103,7 +103,7 @@ def phase_error(h: F64, steps: int, phi: F64) -> F64:
 
 def greatest_error(h: F64, steps: int) -> float:
     """Greatest phase error of N-step fringes, rad."""
-    phi = np.arange(256) * (2 * math.pi / steps / 256)
+    phi: F64 = np.arange(256) * (2 * math.pi / steps / 256)
     return float(np.abs(phase_error(h, steps, phi)).max())
 
 
@@ -186,3 +186,16 @@ def predistortion(response: Response) -> U8:
 def predicted_errors(h: F64, steps: Sequence[int] = (3, 4, 5, 8)) -> Mapping[int, float]:
     """Greatest phase error, rad, that harmonics `h` (h_2 ..) give N-step fringes, by N."""
     return {n: greatest_error(h, n) for n in steps}
+
+
+def drawn_to_power(response: Response, exponent: float) -> Response:
+    """The response as fringes show it that are drawn to a power, `((1 + cos) / 2) ** exponent`: 1 / gamma makes most
+    responses linear. Predicted errors follow; words and figures stay.
+    """
+    h = redrawn(np.asarray(response.harmonics), exponent)
+    return replace(
+        response,
+        gamma=response.gamma * exponent,
+        harmonics=tuple(h.tolist()),
+        error_rad=predicted_errors(h),
+    )

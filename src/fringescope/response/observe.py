@@ -1,4 +1,4 @@
-"""What a capture says about the response: at some good pixels, the phasors of its sets and the pairs that must agree."""
+"""What a capture says about the response: at some good pixels, the phasors of its sets and which pairs must agree."""
 
 from __future__ import annotations
 
@@ -93,10 +93,12 @@ def observe(
     s: ResponseSettings,
     exponents: Sequence[float] = (),
     bins: Mapping[int, tuple[C128, int]] | None = None,
+    smooth: bool = False,
 ) -> Pixels:
     """The observations of a measured view; pairs need settled orders unless both sets have one frequency.
 
-    `exponents`: power to which each set's fringes were drawn (default 1). `bins`: from `read_bins`. Raises
+    `exponents`: power to which each set's fringes were drawn (default 1). `bins`: from `read_bins`. `smooth`: the
+    surface is, which is evidence too (else it is taken for smooth only where there is no other). Raises
     EmptyResultError where too few pixels have usable fringes.
     """
     sets = decoded.sets
@@ -112,7 +114,7 @@ def observe(
     where = np.nonzero(usable & pick)
     lit = decoded.modulation > max(s.min_contrast * float(np.median(decoded.background)), 1.0)
     clipped = np.any([w.saturated > 0 for w in sets], axis=0) & (lit | (decoded.background > 0)) if sets else ~usable
-    saturated = float(np.count_nonzero(clipped) / max(np.count_nonzero(lit | clipped), 1))
+    saturated = float(clipped.sum() / max(int((lit | clipped).sum()), 1))
     if len(where[0]) < s.min_pixels:
         more = f"; {100 * saturated:.0f} % of what is lit saturates: halve the exposure" if saturated > 0.3 else ""
         raise EmptyResultError(
@@ -126,7 +128,7 @@ def observe(
     block = (where[0] * TILES // H) * TILES + where[1] * TILES // W
     pairs = tuple(_pairs(decoded, observed, where))
     triples: tuple[Triple, ...] = ()
-    if not pairs and not any(len(o.bins) for o in observed):
+    if smooth or not (pairs or any(len(o.bins) for o in observed)):
         triples = tuple(_triples(decoded, usable, observed, s))
     return Pixels(observed, pairs, triples, block.astype(np.int64), saturated)
 
@@ -210,7 +212,7 @@ def _triples(decoded: Decoded, usable: Bool, sets: Sequence[Observed], s: Respon
         y, x = np.nonzero(usable[cuts[0]] & usable[cuts[1]] & usable[cuts[2]])
         if len(y) < s.min_pixels:
             continue
-        thin = slice(None, None, max(1, len(y) // s.max_pixels))
+        thin = slice(None, None, max(1, 4 * len(y) // s.max_pixels))
         y, x = y[thin], x[thin]
         phase = np.stack([w.phase[c][y, x] for c in cuts]).astype(np.float64)
         log = np.log(np.stack([w.modulation[c][y, x] for c in cuts]).astype(np.float64))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,7 @@ from scipy.optimize import minimize_scalar
 
 from fringescope.errors import CaptureError, EmptyResultError, UsageError
 from fringescope.response import model
+from fringescope.response.judge import words
 from fringescope.settings import ResponseSettings
 from fringescope.types import F64, Bool, Response
 
@@ -38,7 +40,7 @@ def from_staircase(
     clipped = c >= max_code
     span = c.max(0) - c.min(0)
     seen = span > max(0.05 * max_code, 0.3 * float(np.percentile(span, 95)))
-    saturated = float(np.count_nonzero(clipped.any(0) & seen) / max(np.count_nonzero(seen), 1))
+    saturated = float((clipped.any(0) & seen).sum() / max(int(seen.sum()), 1))
     usable = seen & (np.count_nonzero(~clipped, axis=0) >= max(4, 0.7 * len(x)))
     if np.count_nonzero(usable) < s.min_pixels:
         raise EmptyResultError(
@@ -74,7 +76,7 @@ def from_staircase(
         (),
         {"levels": (x * full_scale).tolist(), "seen": shape.tolist()},
     )
-    return r
+    return replace(r, words=tuple(words(r, {n: (e, scatter[n]) for n, e in errors.items()}, s)))
 
 
 def _shape(c: F64, there: Bool) -> F64:

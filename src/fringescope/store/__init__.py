@@ -14,6 +14,7 @@ from fringescope.store.capture import (
 )
 from fringescope.store.files import new_file, new_folder, write_json
 from fringescope.store.images import Images, write_png, write_tiff
+from fringescope.store.response import read_response, response_document
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
 from fringescope.store.scan import (
     StoredScan,
@@ -59,9 +60,11 @@ __all__ = [
     "read_board",
     "read_capture",
     "read_observations",
+    "read_response",
     "read_rig",
     "read_scan",
     "read_session",
+    "response_document",
     "rig_document",
     "view_inputs",
     "write_capture",

@@ -12,7 +12,7 @@ from fringescope.errors import FormatError
 
 @dataclass(frozen=True)
 class Response:
-    """The light seen for a level asked, up to each pixel's own gain and offset, as the harmonics that it gives a fringe.
+    """The light seen for a level asked, but for each pixel's gain and offset: the harmonics that it gives a fringe.
 
     Where `x = (1 + cos theta) / 2` is asked (0..1 spans the drawn `levels`), what is seen is proportional to
     `cos theta + h_2 cos 2 theta + h_3 cos 3 theta + ..`; so the h are the Chebyshev coefficients of the response curve.
