@@ -3,6 +3,7 @@
 from fringescope.cli.app import app, main, run
 from fringescope.cli.boards import board
 from fringescope.cli.capturing import devices, import_, patterns, settings_, simulate
+from fringescope.cli.responding import response
 from fringescope.cli.scanning import decode, evaluate, export, reconstruct
 from fringescope.cli.showing import demo
 
@@ -18,6 +19,7 @@ __all__ = [
     "main",
     "patterns",
     "reconstruct",
+    "response",
     "run",
     "settings_",
     "simulate",

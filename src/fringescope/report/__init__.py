@@ -13,8 +13,8 @@ from fringescope.report.figures import (
     reasons_picture,
 )
 from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_cloud, render_surface
-from fringescope.report.sighting import sighting_picture
 from fringescope.report.response import RippleCurve, response_picture
+from fringescope.report.sighting import sighting_picture
 from fringescope.report.story import VIEWPOINTS, around, story
 
 __all__ = [
@@ -37,7 +37,7 @@ __all__ = [
     "reasons_picture",
     "render_cloud",
     "render_surface",
-    "sighting_picture",
     "response_picture",
+    "sighting_picture",
     "story",
 ]

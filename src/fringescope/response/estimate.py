@@ -110,7 +110,7 @@ class _Ripple:
     def __init__(self, u: _Unknowns, head: F64, o: Observed) -> None:
         self.h, self.steps = u.seen(head, o), o.steps
         self.dh = u.derivatives(head, lambda t: u.seen(t, o))
-        phi: F64 = np.arange(GRID + 1) * (2 * math.pi / (o.steps * GRID))
+        phi = np.linspace(0, 2 * math.pi / o.steps, GRID + 1)
         x, slope, used, by_h = model.excess(self.h, o.steps, phi)
         log, by = np.log(1 + x), self.dh[used].T @ (by_h / (1 + x))
         self._rows = np.concatenate([[1 + np.imag(slope / (1 + x))], [log.real], [log.imag], by.real, by.imag])

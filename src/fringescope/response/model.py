@@ -103,7 +103,7 @@ def phase_error(h: F64, steps: int, phi: F64) -> F64:
 
 def greatest_error(h: F64, steps: int) -> float:
     """Greatest phase error of N-step fringes, rad."""
-    phi: F64 = np.arange(256) * (2 * math.pi / steps / 256)
+    phi = np.linspace(0, 2 * math.pi / steps, 256, endpoint=False)
     return float(np.abs(phase_error(h, steps, phi)).max())
 
 
