@@ -77,7 +77,7 @@ def homography(a: F64, b: F64, weights: F64 | None = None) -> F64:
             w[:, None] * np.column_stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v]),
         ]
     )
-    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3) if len(A) > 8 else np.linalg.svd(A)[2][-1].reshape(3, 3)
+    H = np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 3)
     H = H / H[2, 2] if abs(H[2, 2]) > 1e-12 else H
     for _ in range(4):
         s = p @ H[2, :2] + H[2, 2]
@@ -91,7 +91,9 @@ def homography(a: F64, b: F64, weights: F64 | None = None) -> F64:
         ww = np.concatenate([w, w])
         if not np.isfinite(J).all() or not np.isfinite(r).all():
             break
-        H = H + np.append(np.linalg.lstsq(J * ww[:, None], r * ww, rcond=None)[0], 0.0).reshape(3, 3)
+        N = (J * ww[:, None] ** 2).T @ J
+        N += 1e-13 * np.trace(N) * np.eye(8)
+        H = H + np.append(np.linalg.solve(N, J.T @ (r * ww**2)), 0.0).reshape(3, 3)
     return np.asarray(np.linalg.inv(Tb) @ H @ Ta)
 
 
@@ -123,7 +125,8 @@ def fit_map(ij: F64, px: F64, sigma: F64 | None = None, rounds: int = 8) -> tupl
         if len(powers):
             r = px - apply(H, ij)
             A = np.column_stack([T, np.ones(n), x])  # what a homography could do as well stays with it
-            bend = np.linalg.lstsq(A * w[:, None], r * w[:, None], rcond=None)[0][: len(powers)]
+            N = (A * w[:, None] ** 2).T @ A
+            bend = np.linalg.solve(N + 1e-12 * np.trace(N) * np.eye(len(N)), A.T @ (r * w[:, None] ** 2))[: len(powers)]
         miss = np.hypot(*(px - apply(H, ij) - T @ bend).T)
         scale = max(1.5 * float(np.median(miss)), 1e-6)
         w = base / np.sqrt(1 + (miss / (3 * scale)) ** 2)
