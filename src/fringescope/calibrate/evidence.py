@@ -236,17 +236,18 @@ def _judge_prediction(
     if predicted is None:
         w.against("no covariance: the error of points cannot be predicted")
         return
-    weak = []
-    for camera, (middle, _, largest) in predicted.per_camera.items():
+    weak: dict[str, float] = {}
+    for camera, (middle, _, _) in predicted.per_camera.items():
+        share = middle / (1000 * footprint[camera])
         if not np.isfinite(middle):
             w.against(f"{camera} and the projector share no view of the measuring volume")
-            continue
-        share = middle / (1000 * footprint[camera])
-        if share > s.max_predicted_px:
-            weak.append(camera)
-            w.against(f"{camera}: the calibration alone makes points uncertain by {_um(middle)} "
-                      f"({share:.2g} of a pixel), up to {_um(largest)}",
-                      2 if share > 10 * s.max_predicted_px else 1)  # fmt: skip
+        elif share > s.max_predicted_px:
+            weak[camera] = share
+    if weak:
+        worst = max(weak.values())
+        figures = ", ".join(f"{c} {_um(predicted.per_camera[c][0])}" for c in weak)
+        w.against(f"the calibration alone makes points uncertain: {figures} ({worst:.2g} of a pixel on the board)",
+                  2 if worst > 10 * s.max_predicted_px else 1)  # fmt: skip
     finite = [v for v in predicted.per_camera.values() if np.isfinite(v[0])]
     if weak:
         w.next.append("take more poses, tilted by 20 to 30 degrees to all sides, near and far in the measuring volume")
