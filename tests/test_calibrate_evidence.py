@@ -9,7 +9,8 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from fringescope import geometry
-from fringescope.calibrate import coverage, evidence, prediction, scatter
+from fringescope.calibrate import coverage, prediction, scatter
+from fringescope.calibrate.evidence import correlations, evidence
 from fringescope.settings import EvidenceSettings
 from fringescope.types import Camera, HeldOut, LeftOut, Lens, Pose, Projector, Rig
 from tests.calibration_scenes import board_poses, calibration, cv_project
@@ -206,7 +207,7 @@ def test_prediction_grows_with_the_covariance_and_needs_one():
 
 def test_a_good_calibration_is_called_good():
     c = calibration("paper", n=12, sigma=0.01)
-    e = evidence.evidence(c, held(c), S)
+    e = evidence(c, held(c), S)
     assert e.verdict == "good", e.weak
     text = " ".join(e.good)
     assert "0.014 px" in text
@@ -224,7 +225,7 @@ def test_what_to_photograph_next_is_said():
     flat = Rotation.from_euler("x", np.pi).as_matrix()
     poses = {k: Pose(flat, [-38, -3, 0.1 * i]) for i, k in enumerate(board_poses(9, rng))}
     c = calibration("paper", poses=poses, sigma=0.02)
-    e = evidence.evidence(c, held(c), S)
+    e = evidence(c, held(c), S)
     told = " | ".join(e.next)
     assert "no pose tilted towards camera1" in told
     assert "mm nearer and farther" in told
@@ -249,7 +250,7 @@ def test_tilt_is_told_on_the_right_side():
     assert np.degrees(tilts["projector"][0][1]) == pytest.approx(20, abs=1)
     assert tilts["camera1"][0][1] < tilts["projector"][0][1]  # seen straighter by that camera
     assert tilts["camera2"][0][1] > tilts["projector"][0][1]
-    told = " ".join(evidence.evidence(c, held(c), S).next)
+    told = " ".join(evidence(c, held(c), S).next)
     assert "away from camera1" in told
     assert "tilted towards camera1" not in told
 
@@ -288,7 +289,7 @@ def test_cells_that_the_projector_does_not_light_are_not_asked_for():
 )
 def test_what_is_weak_lowers_the_verdict(change, said, verdict):
     c = calibration("pair", **{"n": 12, "sigma": 0.02, **change})
-    e = evidence.evidence(c, held(c, px=change.get("corner_px", 0.01)), S)
+    e = evidence(c, held(c, px=change.get("corner_px", 0.01)), S)
     assert any(said in w for w in e.weak), e.weak
     assert e.verdict == verdict
 
@@ -304,7 +305,7 @@ def test_what_is_weak_lowers_the_verdict(change, said, verdict):
 )
 def test_boards_that_were_not_used_judge(change, said, verdict):
     c = calibration("pair", n=12, sigma=0.02)
-    e = evidence.evidence(c, held(c, **change), S)
+    e = evidence(c, held(c, **change), S)
     assert any(said in w for w in e.weak), e.weak
     assert e.verdict == verdict
 
@@ -314,7 +315,7 @@ def test_a_lens_model_that_does_not_fit_is_no_good_calibration():
         return 0.05 * ((uv - 300) / 300) ** 2 if device == "camera1" else np.zeros_like(uv)
 
     c = calibration("pair", n=12, sigma=0.02, bias=bias)
-    e = evidence.evidence(c, held(c, px=0.05), S)
+    e = evidence(c, held(c, px=0.05), S)
     assert e.verdict == "usable"
     assert any("camera1: corners residuals repeat" in w for w in e.weak)
 
@@ -322,7 +323,7 @@ def test_a_lens_model_that_does_not_fit_is_no_good_calibration():
 def test_one_camera_and_nothing_held_out():
     c = calibration("single", n=10, sigma=0.02, volume=False)
     c = dataclasses.replace(c, left_out=(LeftOut("pose77", None, None, "it moved"),))
-    e = evidence.evidence(c, (), S)
+    e = evidence(c, (), S)
     assert any("held out" in w for w in e.weak)
     assert any("pose77" in w for w in e.weak)
     assert e.prediction.views_um == {}
@@ -334,13 +335,13 @@ def test_tight_pairs_are_listed():
     C = c.covariance.copy()
     a, b = np.sqrt(C[0, 0]), np.sqrt(C[2, 2])
     C[0, 2] = C[2, 0] = -0.99 * a * b
-    found = evidence.correlations(dataclasses.replace(c, covariance=C), 0.95)
+    found = correlations(dataclasses.replace(c, covariance=C), 0.95)
     assert found == (("projector fx", "projector cx", pytest.approx(-0.99)),)
 
 
 def test_a_calibration_without_residuals_of_one_kind():
     c = calibration("single", sigma=0.02)
     bare = tuple(dataclasses.replace(r, sample=np.zeros((0, 2)), sample_uv=np.zeros((0, 2))) for r in c.residuals)
-    e = evidence.evidence(dataclasses.replace(c, residuals=bare), (), S)
+    e = evidence(dataclasses.replace(c, residuals=bare), (), S)
     assert e.verdict == "do not use"
     assert [f.device for f in e.fields] == ["camera1"]
