@@ -358,7 +358,7 @@ def _score(
         p, state = replace_models(problem, first.state, models, s)
         weights = first.weights
         try:
-            state, n = minimise(p, state, weights, s.rounds, 1e-6)
+            state, n = minimise(p, state, weights, s.rounds, 1e-4)
             tried[models] = float(np.nansum(held_out_scores(p, Fit(state, first.noise, weights, n)))), state
         except (CalibrationError, np.linalg.LinAlgError):
             tried[models] = np.inf, first.state

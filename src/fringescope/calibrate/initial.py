@@ -76,6 +76,11 @@ def begin(problem: Problem, focal: dict[int, float], pinned: dict[int, tuple[flo
     return _assemble(problem, lenses, seen, found, best)
 
 
+def readings_of(problem: Problem, lens: F64) -> dict[int, tuple[Reading, ...]]:
+    """Both readings of every sighting under known lenses (D, 9)."""
+    return {s.sighting: _with_readings(s, lens[s.camera]).readings for s in _gather(problem) if s is not None}
+
+
 def homography(xy: F64, px: F64) -> tuple[F64, F64] | None:
     """Map of the board to the picture (3, 3) and the distances (n,) of the corners from it; None if there is none."""
     try:
@@ -373,7 +378,7 @@ def _assemble(problem: Problem, lenses: dict[int, F64], seen: Sequence[Seen], fo
         _, board_R[p], board_t[p] = min(options, key=lambda o: o[0])
     normals = np.array([board_R[p][:, 2] for p in boards])
     readings = {s.sighting: s.readings for s in seen}
-    return Start(State(lens, R, t, board_R, board_t, np.zeros(5)), frozenset(trusted), _widest(normals), readings)
+    return Start(State(lens, R, t, board_R, board_t, np.zeros(5), np.zeros(D)), frozenset(trusted), _widest(normals), readings)
 
 
 def _widest(normals: F64) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fringescope import geometry
-from fringescope.calibrate.adjust import Fit, residuals
+from fringescope.calibrate.adjust import NORMAL_MAD, Fit, residuals
 from fringescope.calibrate.initial import projector_coordinates
 from fringescope.calibrate.problem import (
     CORNERS,
@@ -301,16 +301,16 @@ def _local(d: F64, uv: F64) -> tuple[F64, F64] | None:
     A = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     keep = np.ones(len(x), dtype=bool)
     for _ in range(3):
-        if keep.sum() < 10 or np.linalg.matrix_rank(A[keep]) < 6:
+        N = A[keep].T @ A[keep]
+        if keep.sum() < 10 or np.linalg.cond(N) > 1e8:
             return None
-        fit, *_ = np.linalg.lstsq(A[keep], uv[keep], rcond=None)
+        fit = np.linalg.solve(N, A[keep].T @ uv[keep])
         r = np.abs(uv - A @ fit)
-        keep = (r <= 4 * 1.4826 * np.median(r[keep], axis=0) + 1e-9).all(axis=1)
+        keep = (r <= 4 * NORMAL_MAD * np.median(r[keep], axis=0) + 1e-9).all(axis=1)
     if keep.sum() < 10:
         return None
-    gain = np.linalg.pinv(A[keep])[0]
-    spread = np.sqrt(np.sum((uv[keep] - A[keep] @ fit) ** 2, axis=0) / max(keep.sum() - 6, 1))
-    return fit[0], np.maximum(spread * np.linalg.norm(gain), 1e-9)
+    spread = np.sqrt(np.sum(r[keep] ** 2, axis=0) / max(keep.sum() - 6, 1))
+    return fit[0], np.maximum(spread * np.sqrt(np.linalg.inv(N)[0, 0]), 1e-9)
 
 
 def _words(problem: Problem, parameters: Sequence[Parameter], s: CalibrateSettings) -> list[str]:

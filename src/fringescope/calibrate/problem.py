@@ -47,7 +47,10 @@ class Sizes:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """All unknowns: lens (D, 9), T_device_projector (D: R (D, 3, 3), t (D, 3)), T_projector_board (P), shape (5,)."""
+    """All unknowns: lens (D, 9), T_device_projector (D: R (D, 3, 3), t (D, 3)), T_projector_board (P), shape (5,).
+
+    `skew` (D,) belongs to rigs of others; it is never solved for.
+    """
 
     lens: F64
     R: F64
@@ -55,6 +58,7 @@ class State:
     board_R: F64
     board_t: F64
     shape: F64
+    skew: F64
 
     def moved(self, step: F64) -> State:
         """The state after a step in the full vector: devices of 15, shape of 5, boards of 6."""
@@ -70,7 +74,13 @@ class State:
             board_turn @ self.board_R,
             self.board_t + board[:, 3:],
             self.shape + step[D * DEVICE : D * DEVICE + len(SHAPE)],
+            self.skew,
         )
+
+    def lens_ten(self, device: int) -> F64:
+        """The ten numbers of a device's lens that kernels take."""
+        lens = self.lens[device]
+        return np.concatenate([lens[:4], self.skew[device : device + 1], lens[4:]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,11 +171,6 @@ def board_frame(board: Board) -> F64:
     return np.array([w / 2 - board.square_mm, h / 2 - board.square_mm, float(np.hypot(w, h)) / 2])
 
 
-def lens_ten(lens: F64) -> F64:
-    """Nine numbers of a lens to the ten that kernels take (no skew)."""
-    return np.concatenate([lens[:4], [0.0], lens[4:]])
-
-
 def evaluate(problem: Problem, state: State, b: Block, derivatives: bool = True) -> Evaluated:
     """Residuals of a block and, where asked, their derivatives by the unknowns at `columns`."""
     frame, none = problem.frame, np.zeros((0, 0, 0))
@@ -179,7 +184,7 @@ def evaluate(problem: Problem, state: State, b: Block, derivatives: bool = True)
         J = np.empty((n, 2, 26)) if derivatives and n else none
         kernel.point_rows(
             b.xy, b.place, state.shape, frame, R_rb, t_rb, np.ascontiguousarray(state.R[device]),
-            np.ascontiguousarray(state.t[device]), lens_ten(state.lens[device]), residual, J,
+            np.ascontiguousarray(state.t[device]), state.lens_ten(device), residual, J,
         )  # fmt: skip
         at = problem.device_at(device)
         uv = residual + b.place if device == 0 else np.full((n, 2), np.nan)
@@ -188,7 +193,7 @@ def evaluate(problem: Problem, state: State, b: Block, derivatives: bool = True)
     J = np.empty((n, len(b.g), 35)) if derivatives and n else none
     kernel.sample_rows(
         b.place, b.cycles, b.g, state.shape, frame, R_rb, t_rb, np.ascontiguousarray(state.R[b.device]),
-        np.ascontiguousarray(state.t[b.device]), lens_ten(state.lens[b.device]), lens_ten(state.lens[0]), residual, uv,
+        np.ascontiguousarray(state.t[b.device]), state.lens_ten(b.device), state.lens_ten(0), residual, uv,
         board_xy, J,
     )  # fmt: skip
     at = problem.device_at(b.device)

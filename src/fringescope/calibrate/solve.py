@@ -43,7 +43,7 @@ from fringescope.settings import CalibrateSettings
 from fringescope.types import F64, Board, Calibration, LeftOut, Sighting
 
 COARSE = 120  #: samples of each picture while the solve looks for its way
-CHOOSING = 400  #: and while lens models are compared
+CHOOSING = 250  #: and while lens models are compared
 FEWEST_CORNERS = 6  #: a picture with fewer says too little
 
 

@@ -13,8 +13,6 @@ import numpy as np
 from numba import njit
 
 from fringescope.kernels.lens import distort_jacobian, from_plane
-from fringescope.threads import by_rows
-
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _by_terms(x, y, dx, dy):
@@ -34,8 +32,8 @@ def _sag(x, y, shape, frame):
     return z, zx, zy, p, q
 
 
-@by_rows(lambda xy, *_: xy.shape[0])
-def point_rows(first, last, xy, place, shape, frame, R_rb, t_rb, R_cr, t_cr, lens, residual, J):
+@njit(cache=True, nogil=True, error_model="numpy")
+def point_rows(xy, place, shape, frame, R_rb, t_rb, R_cr, t_cr, lens, residual, J):
     """Board points (n, 2) mm, seen at `place` (n, 2): residual (n, 2) = predicted - seen, NaN behind the device.
 
     J (n, 2, 26): by nine of the lens, turn and shift of T_cr, turn and shift of T_rb, five of the board's shape; an
@@ -44,7 +42,7 @@ def point_rows(first, last, xy, place, shape, frame, R_rb, t_rb, R_cr, t_cr, len
     want = J.shape[0] > 0
     dx, dy = np.empty(5), np.empty(5)
     h = np.empty(3)
-    for i in range(first, last):
+    for i in range(xy.shape[0]):
         bx = xy[i, 0] + shape[4] * (xy[i, 1] - frame[1])
         by = xy[i, 1] + shape[3] * (xy[i, 1] - frame[1])
         bz, zx, zy, p, q = _sag(bx, by, shape, frame)
@@ -107,9 +105,9 @@ def _meet(o, d, shape, frame):
     return np.nan
 
 
-@by_rows(lambda px, *_: px.shape[0])
+@njit(cache=True, nogil=True, error_model="numpy")
 def sample_rows(
-    first, last, px, cycles, g, shape, frame, R_rb, t_rb, R_cr, t_cr, camera, projector, residual, uv, board_xy, J
+    px, cycles, g, shape, frame, R_rb, t_rb, R_cr, t_cr, camera, projector, residual, uv, board_xy, J
 ):
     """Cycles (k, d) measured at camera pixels (k, 2) along directions g (d, 2), the reference being the projector.
 
@@ -131,7 +129,7 @@ def sample_rows(
         ob[k] = 0.0
         for a in range(3):
             ob[k] += R_rb[a, k] * (o[a] - t_rb[a])
-    for i in range(first, last):
+    for i in range(px.shape[0]):
         for a in range(directions):
             residual[i, a] = np.nan
         uv[i, 0] = np.nan
