@@ -39,13 +39,13 @@ def response_picture(
     """The response in pictures, (h, w, 3) uint8; `curve`: levels sent and light seen, shares 0..1."""
     rows = 1 + (len(ripples) + 2) // 3
     with mpl.rc_context(_FONT):
-        fig = Figure(figsize=(12, 1.5 + 3.3 * rows), dpi=110, facecolor=PAPER)
-        top = 1 - 1.25 / (1.5 + 3.3 * rows)
-        grid = fig.add_gridspec(rows, 3, left=0.06, right=0.98, bottom=0.55 / (1.5 + 3.3 * rows), top=top,
+        fig = Figure(figsize=(12, 2.0 + 3.3 * rows), dpi=110, facecolor=PAPER)
+        top = 1 - 1.5 / (2.0 + 3.3 * rows)
+        grid = fig.add_gridspec(rows, 3, left=0.06, right=0.98, bottom=0.55 / (2.0 + 3.3 * rows), top=top,
                                 wspace=0.28, hspace=0.5)  # fmt: skip
-        fig.text(0.06, 1 - 0.35 / (1.5 + 3.3 * rows), title, fontsize=14, fontweight="bold", va="center")
+        fig.text(0.06, 1 - 0.35 / (2.0 + 3.3 * rows), title, fontsize=14, fontweight="bold", va="center")
         for i, line in enumerate(response.words[:3]):
-            fig.text(0.06, 1 - (0.62 + 0.19 * i) / (1.5 + 3.3 * rows), line, fontsize=9.5, color=PALE, va="center")
+            fig.text(0.06, 1 - (0.62 + 0.19 * i) / (2.0 + 3.3 * rows), line, fontsize=9.5, color=PALE, va="center")
         _curve(fig.add_subplot(grid[0, 0]), response, curve)
         _harmonics(fig.add_subplot(grid[0, 1]), response)
         _errors(fig.add_subplot(grid[0, 2]), response.error_rad, response.error_sigma)

@@ -14,7 +14,7 @@ do not pass for evidence (cluster-robust covariance, doi 10.1093/biomet/73.1.13)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,10 +148,12 @@ def disagreement(pair: Pair, sets: tuple[Observed, ...], h_other: F64 | None, h_
     return _wrap(a - pair.ratio * b)
 
 
-def _pair_equations(n: int, pair: Pair, pixels: Pixels, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64, int]]:
+def _pair_equations(
+    n: int, pair: Pair, pixels: Pixels, u: _Unknowns, ripples: Sequence[_Ripple]
+) -> list[tuple[F64, F64, F64, int]]:
     """Phase, log modulation and background of a pair: residual, derivatives by the head, sigma, own constant or -1."""
     o, f = pixels.sets[pair.other], pixels.sets[pair.fine]
-    of, ff = _Ripple(u, head, o), _Ripple(u, head, f)
+    of, ff = ripples[pair.other], ripples[pair.fine]
     fine = ff.at(ff.true(pair.fine_phase))
     other = of.at(pair.ratio * fine.phi)
     r = pair.ratio
@@ -175,9 +177,8 @@ def _pair_equations(n: int, pair: Pair, pixels: Pixels, u: _Unknowns, head: F64)
     ]
 
 
-def _bin_equations(o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64]]:
+def _bin_equations(o: Observed, u: _Unknowns, ripple: _Ripple) -> list[tuple[F64, F64, F64]]:
     """Real and imaginary part of the bins beside the fringe, turned with the phase so that a harmonic stands still."""
-    ripple = _Ripple(u, head, o)
     phi = ripple.true(o.phase)
     gain = np.exp(ripple.at(phi).gain)
     out = []
@@ -192,9 +193,8 @@ def _bin_equations(o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64,
     return out
 
 
-def _triple_equations(t: Triple, o: Observed, u: _Unknowns, head: F64) -> list[tuple[F64, F64, F64]]:
+def _triple_equations(t: Triple, ripple: _Ripple) -> list[tuple[F64, F64, F64]]:
     """Second differences of the corrected phase and of the corrected log modulation: zero on what is smooth."""
-    ripple = _Ripple(u, head, o)
     a, b, c = sets = [ripple.at(ripple.true(p)) for p in t.phase]
     by = [x.error_by / np.maximum(x.slope, 0.05) for x in sets]
     bend = _wrap(c.phi - b.phi) - _wrap(b.phi - a.phi)
@@ -207,6 +207,7 @@ def _triple_equations(t: Triple, o: Observed, u: _Unknowns, head: F64) -> list[t
 
 def _equations(pixels: Pixels, u: _Unknowns, theta: F64) -> list[_Equation]:
     head = theta[: u.head]
+    ripples = [_Ripple(u, head, o) for o in pixels.sets]
     out: list[_Equation] = []
 
     def add(r: F64, J: F64, sigma: F64, block: NDArray[np.int64], own: int = -1) -> None:
@@ -218,14 +219,14 @@ def _equations(pixels: Pixels, u: _Unknowns, theta: F64) -> list[_Equation]:
         out.append(_Equation(r, full, sigma, block))
 
     for n, pair in enumerate(pixels.pairs):
-        for r, J, sigma, own in _pair_equations(n, pair, pixels, u, head):
+        for r, J, sigma, own in _pair_equations(n, pair, pixels, u, ripples):
             add(r, J, sigma, pixels.block, own)
-    for o in pixels.sets:
+    for o, ripple in zip(pixels.sets, ripples, strict=True):
         if len(o.bins):
-            for r, J, sigma in _bin_equations(o, u, head):
+            for r, J, sigma in _bin_equations(o, u, ripple):
                 add(r, J, sigma, pixels.block)
     for t in pixels.triples:
-        for r, J, sigma in _triple_equations(t, pixels.sets[t.of], u, head):
+        for r, J, sigma in _triple_equations(t, ripples[t.of]):
             add(r, J, sigma, t.block)
     return out
 

@@ -20,6 +20,7 @@ from fringescope.types import F64, AnyArray, Decoded, FrameKey, FringeSet, Respo
 STEPS = (3, 4, 5, 8)  #: what errors are predicted for
 LEVELS = (0.0, 1.0)
 BINS = 48  #: of the phase, in curves
+BLOWN = 0.5  #: share of saturated pixels beyond which the rest proves nothing
 FLAT = 0.3  #: slope of the bright end over that of the middle, relative to the power law's, below which it saturates
 
 
@@ -97,7 +98,8 @@ def _conclude(pixels: Pixels, s: ResponseSettings, levels: tuple[float, float], 
         len(pixels) or int(sum(t.block.size for t in pixels.triples)),
         pixels.saturated,
     )
-    needed = any(_needs(found, o, _measures(o, pixels.sets), s) for o in pixels.sets)
+    blown = pixels.saturated > BLOWN
+    needed = not blown and any(_needs(found, o, _measures(o, pixels.sets), s) for o in pixels.sets)
     figures: dict[str, Any] = {
         "explained": found.explained,
         "sets": {str(n): {"error_rad": e, "sigma_rad": d} for n, (e, d) in sets.items()},
@@ -174,6 +176,8 @@ def words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSetti
         yield f"needs correction: {told}; give this response to reconstruct and decode"
         more = f", or take {min(fair)} steps ({r.error_rad[min(fair)]:.4f} rad)" if fair else ""
         yield f"or do without: draw the patterns through the table 'predistortion'{more}"
+    elif r.saturated > BLOWN:
+        yield f"nothing is proved: most of what is lit saturates; the rest says {told}"
     elif worst > s.negligible_rad and worst <= s.significance * sigma:
         yield f"nothing is proved: {told}; more light, or a larger and plainer surface, would tell"
     else:

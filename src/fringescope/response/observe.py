@@ -137,7 +137,9 @@ def _usable(decoded: Decoded, s: ResponseSettings) -> Bool:
     out = np.ones(decoded.shape, bool)
     out &= (decoded.reasons & np.uint16(0xFFFF ^ UNUSABLE)) == 0
     for w in decoded.sets:
-        out &= (w.saturated == 0) & (w.sigma < s.max_sigma_rad) & (w.modulation > s.min_contrast * w.background)
+        lit = (w.saturated == 0) & (w.modulation > s.min_contrast * w.background)
+        usual = float(np.median(w.sigma[lit])) if lit.any() else 0.0  # a strong response passes for noise where N > 3
+        out &= lit & (w.sigma < max(s.max_sigma_rad, min(2 * usual, 1.0)))
     for d in decoded.directions:
         out &= np.isfinite(d.phase)
     return out
@@ -236,7 +238,7 @@ def read_bins(
         one = plan.sets[key.set_index]
         if not isinstance(one, FringeSet) or one.steps < 4 or one.exposure_us is not None:
             continue
-        stride = _stride(frame.shape[0] * frame.shape[1], 4 * pixels)
+        stride = _stride(frame.shape[0] * frame.shape[1], 2 * pixels)
         thin = frame[::stride, ::stride].astype(np.float64)
         if plan.pixel_format is PixelFormat.RGB8:
             thin = thin.sum(axis=2)

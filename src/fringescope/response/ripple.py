@@ -13,6 +13,7 @@ from fringescope.types import F64, Decoded
 DEGREE = 5  #: of the polynomial that a plane's phase is, behind two lenses
 BINS = 48
 SAMPLES = 60_000
+ROUNDS = 8  #: of fitting and leaving out what lies far off
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +55,11 @@ def plane_ripple(decoded: Decoded, index: int = 0) -> Ripple:
     waves = np.column_stack([f(m * fine.steps * phase) for m in (1, 2) for f in (np.sin, np.cos)])
     A = np.concatenate([smooth, waves], axis=1)  # fitted together: a smooth surface must not follow the ripple
     keep = np.ones(len(y), bool)
-    for _ in range(3):
+    for _ in range(ROUNDS):
         c = np.linalg.lstsq(A[keep], phase[keep], rcond=None)[0]
         off = phase - A @ c
         spread = 1.4826 * float(np.median(np.abs(off[keep] - np.median(off[keep]))))
-        keep = np.abs(off) < 5 * max(spread, 1e-6)
+        keep = np.abs(off - np.median(off[keep])) < 4 * max(spread, 1e-6)
     rest = phase - smooth @ c[: len(terms)]
     bins = np.minimum(((wrapped + math.pi) / (2 * math.pi) * BINS).astype(np.int64), BINS - 1)
     count = np.bincount(bins[keep], minlength=BINS)
