@@ -65,8 +65,8 @@ def find(image: F32, weights: F64, saturated: Bool, board: Board, name: str, s: 
             continue
         if best is None or len(found.px) > len(best.px):
             best = found
-        if len(best.px) >= wanted:
-            break
+        if sorted(np.ptp(best.index, axis=0) + 1) == sorted(board.inner_corners):
+            break  # every place of the board was looked at
     least = max(4, min(9, wanted // 2))
     if best is None or len(best.px) < least:
         if failure:

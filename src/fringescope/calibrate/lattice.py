@@ -32,29 +32,46 @@ class LatticeMap:
 
     def __call__(self, ij: F64) -> F64:
         """Pixels (n, 2) of lattice coordinates (n, 2)."""
-        return apply(self.H, ij) + self._terms(ij) @ self.bend
+        out = apply(self.H, ij)
+        return out + terms((ij - self.middle) / self.half, self.powers) @ self.bend if len(self.powers) else out
 
     def steps(self, ij: F64) -> tuple[F64, F64]:
         """Pixels per square (n, 2) along the lattice's two axes at lattice coordinates (n, 2)."""
-        e = 1e-3
-        return tuple((self(ij + d) - self(ij - d)) / (2 * e) for d in np.eye(2) * e)  # type: ignore[return-value]
+        H = self.H
+        q = ij @ H[:, :2].T + H[:, 2]
+        with np.errstate(all="ignore"):
+            p, w = q[:, :2] / q[:, 2:], 1 / q[:, 2:]
+            along = [(H[:2, k] - p * H[2, k]) * w for k in (0, 1)]
+        if len(self.powers):
+            x = (ij - self.middle) / self.half
+            for k in (0, 1):
+                down = self.powers - np.eye(2, dtype=np.int32)[k]
+                factor = self.powers[:, k] / self.half
+                along[k] = along[k] + terms(x, np.maximum(down, 0)) @ (factor[:, None] * self.bend)
+        return along[0], along[1]
 
     def inverse(self, px: F64) -> F64:
         """Lattice coordinates (n, 2) of pixels (n, 2); NaN where there are none."""
         ij = apply(np.linalg.inv(self.H), px)
-        for _ in range(5):
+        for _ in range(4 if len(self.powers) else 0):
             a, b = self.steps(ij)
             r = px - self(ij)
             with np.errstate(all="ignore"):
                 det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-                ij = ij + np.column_stack([r[:, 0] * b[:, 1] - r[:, 1] * b[:, 0], r[:, 1] * a[:, 0] - r[:, 0] * a[:, 1]]) / det[:, None]
+                ij[:, 0] += (r[:, 0] * b[:, 1] - r[:, 1] * b[:, 0]) / det
+                ij[:, 1] += (r[:, 1] * a[:, 0] - r[:, 0] * a[:, 1]) / det
         with np.errstate(invalid="ignore"):
             ij[~(np.abs(px - self(ij)).max(1) < 0.5)] = np.nan
         return ij
 
-    def _terms(self, ij: F64) -> F64:
-        x = (ij - self.middle) / self.half
-        return np.asarray(x[:, :1] ** self.powers[:, 0] * x[:, 1:] ** self.powers[:, 1])
+
+def terms(x: F64, powers: I32) -> F64:
+    """Monomials (n, t) of points x (n, 2) with exponents (t, 2)."""
+    top = int(powers.max(initial=0))
+    table = np.ones((2, top + 1, len(x)))
+    for k in range(1, top + 1):
+        table[:, k] = table[:, k - 1] * x.T
+    return np.ascontiguousarray((table[0, powers[:, 0]] * table[1, powers[:, 1]]).T)
 
 
 def apply(H: F64, p: F64) -> F64:
@@ -117,7 +134,7 @@ def fit_map(ij: F64, px: F64, sigma: F64 | None = None, rounds: int = 8) -> tupl
     w = base.copy()
     bend = np.zeros((len(powers), 2))
     x = (ij - middle) / half
-    T = x[:, :1] ** powers[:, 0] * x[:, 1:] ** powers[:, 1]
+    T = terms(x, powers)
     H = homography(ij, px)
     miss = np.zeros(n)
     for _ in range(rounds):

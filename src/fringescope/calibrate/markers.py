@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from typing import Any
 
@@ -28,7 +29,7 @@ def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, t
     words = dictionary(board.dictionary)
     where = _positions(board)
     seen = _read(found, image, board, words)
-    votes = _votes(seen, where, board)
+    votes = _votes(seen, where)
     if not votes:
         raise CalibrationError(_why_none(found, image, board, name, where))
     (best, count), *rest = votes.most_common(2)
@@ -97,21 +98,18 @@ def _bits(found: Corners, image: F32, board: Board, square: I32, cells: int) -> 
 
 
 def _votes(
-    seen: list[tuple[I32, int, int]], where: list[dict[int, tuple[int, int]]], board: Board
+    seen: list[tuple[I32, int, int]], where: list[dict[int, tuple[int, int]]]
 ) -> Counter[tuple[int, int, int]]:
     """Votes for (quarter turns, offset) of the lattice on the board; the counting of squares with more of them."""
     best: Counter[tuple[int, int, int]] = Counter()
-    for places in where:
+    for places, sense in itertools.product(where, (1, -1)):
         votes: Counter[tuple[int, int, int]] = Counter()
         for square, marker, quarter in seen:
-            if marker not in places:
-                continue
-            for q in (quarter % 4, (-quarter) % 4):
+            if marker in places:
+                q = (sense * quarter) % 4
                 R = np.linalg.matrix_power(QUARTER, q)
                 t = np.round(np.array(places[marker]) - 0.5 - (square - 0.5) @ R.T).astype(int)
                 votes[q, int(t[0]), int(t[1])] += 1
-                if quarter % 2 == 0:
-                    break
         if votes and (not best or max(votes.values()) > max(best.values())):
             best = votes
     return best

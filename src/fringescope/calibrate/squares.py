@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from fringescope.calibrate.corners import Corners
+from fringescope.calibrate.lattice import terms as monomials
 from fringescope.settings import BoardSettings
 from fringescope.types import F32, F64, I32, Board, Bool, Decoded, Reason
 
@@ -101,7 +102,7 @@ def _area(
     side = float(np.sqrt(cv2.contourArea(outline.astype(np.float32))))
     block = (slice(y0, y1 + 1), slice(x0, x1 + 1))
     x, y = np.meshgrid(np.arange(x0, x1 + 1, dtype=np.float64), np.arange(y0, y1 + 1, dtype=np.float64))
-    clear = (s.edge_pixels + found.blur) if not board.dictionary else 3 * math.hypot(found.blur, 0.3) + 0.5
+    clear = (s.edge_pixels + found.blur) if not board.dictionary else max(1.0, 2.4 * math.hypot(found.blur, 0.3))
     inset = max(s.edge_clearance * side if not board.dictionary else 0.0, clear)
     inside = _inside(outline, x, y, inset)
     if inside.sum() < s.min_square_pixels and not board.dictionary:
@@ -148,7 +149,7 @@ def _white(block: F32, found: Corners, clear: float) -> Bool:
     """White parts of a block, `clear` pixels from anything dark."""
     light = np.percentile(block, 95)
     dark = light * float(np.median((found.level - found.half) / (found.level + found.half)))
-    size = 2 * math.ceil(clear) + 1
+    size = 2 * math.ceil(clear - 0.5) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     bright = (block > 0.5 * (light + dark)).astype(np.uint8)
     return np.asarray(cv2.erode(bright, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
@@ -163,8 +164,8 @@ def _settle(areas: list[Area], found: Corners) -> tuple[list[Area], int, int]:
         return areas, 0, 0
     out = [Area(a.square, a.px, a.phase.copy(), a.sigma.copy()) for a in areas]
     repaired = dropped = 0
+    lattice = np.split(found.smooth.inverse(np.concatenate([a.px for a in out])), np.cumsum([len(a.px) for a in out])[:-1])
     for d in range(areas[0].phase.shape[1]):
-        lattice = [found.smooth.inverse(a.px) for a in out]
         thin = [np.arange(0, len(a.px), len(a.px) // 40 + 1) for a in out]
         x = np.concatenate([ij[t] for ij, t in zip(lattice, thin, strict=True)])
         y = np.concatenate([a.phase[t, d] for a, t in zip(out, thin, strict=True)]) / (2 * math.pi)
@@ -190,12 +191,11 @@ class _Polynomial:
 
     def __init__(self, x: F64, degree: int) -> None:
         self.middle, self.half = np.median(x, 0), max(float(np.ptp(x, axis=0).max()) / 2, 1e-9)
-        self.powers = [(a, d - a) for d in range(degree + 1) for a in range(d, -1, -1)]
+        self.powers = np.array([(a, d - a) for d in range(degree + 1) for a in range(d, -1, -1)], dtype=np.int32)
         self.value = np.zeros(len(self.powers))
 
     def terms(self, x: F64) -> F64:
-        q = (x - self.middle) / self.half
-        return np.column_stack([q[:, 0] ** a * q[:, 1] ** b for a, b in self.powers])
+        return monomials((x - self.middle) / self.half, self.powers)
 
     def __call__(self, x: F64) -> F64:
         return np.asarray(self.terms(x) @ self.value)
@@ -292,14 +292,15 @@ def _centres(chosen: list[tuple[Area, _Fit]], found: Corners, g: F64) -> tuple[I
         c, r = (int(v) for v in a.square)
         if not all(p in known for p in ((c - 1, r - 1), (c, r - 1), (c - 1, r), (c, r))):
             continue
-        place = centre(found, a.square)
-        solved = _coordinate(place, f, g)
-        if solved is None:
+        place, unsure = centre(found, a.square)
+        here, right, below = (_coordinate(place + d, f, g) for d in ((0, 0), (1, 0), (0, 1)))
+        if here is None or right is None or below is None:
             continue
         squares.append(a.square)
         places.append(place)
-        uvs.append(solved[0])
-        sigmas.append(solved[1])
+        uvs.append(here[0])
+        per_pixel = np.hypot(right[0] - here[0], below[0] - here[0])
+        sigmas.append(np.hypot(here[1], per_pixel * unsure))
     m = len(squares)
     return (
         np.array(squares, dtype=np.int32).reshape(m, 2),
@@ -309,8 +310,10 @@ def _centres(chosen: list[tuple[Area, _Fit]], found: Corners, g: F64) -> tuple[I
     )
 
 
-def centre(found: Corners, square: I32) -> F64:
-    """Where the diagonals of a lattice square cross, pixels (2,): the smooth map, corrected by the corners around it."""
+def centre(found: Corners, square: I32) -> tuple[F64, float]:
+    """Where the diagonals of a lattice square cross, pixels (2,), and the standard deviation of each: the smooth map,
+    corrected by the corners around it.
+    """
     at = square - 0.5
     d = found.index - at
     near = np.abs(d).max(1) < 2.0
@@ -319,8 +322,9 @@ def centre(found: Corners, square: I32) -> F64:
     if len(d) >= 12:
         A = np.column_stack([A, d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2])
     w = 1 / np.maximum(found.sigma[near], 1e-9) ** 2
-    shift = _least_squares(A, miss, w / w.max())[0][0]
-    return np.asarray(found.smooth(at[None])[0] + shift)
+    fit, C = _least_squares(A, miss, w)
+    scatter = float((w[:, None] * (miss - A @ fit) ** 2).sum()) / max(2 * (len(A) - A.shape[1]), 1)
+    return np.asarray(found.smooth(at[None])[0] + fit[0]), math.sqrt(float(C[0, 0]) * max(scatter, 1.0))
 
 
 def _coordinate(place: F64, f: _Fit, g: F64) -> tuple[F64, F64] | None:
