@@ -1,4 +1,4 @@
-"""Inner corners of the board in one picture: found on reduced pictures, fitted at full resolution, judged one by one."""
+"""Inner corners of the board in one picture: found on reduced pictures, fitted at full size, judged one by one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fringescope.calibrate.saddles import find_saddles
 from fringescope.errors import CalibrationError
 from fringescope.kernels import corners as k
 from fringescope.settings import BoardSettings
-from fringescope.types import F32, F64, I32, Board, Bool
+from fringescope.types import F32, F64, I32, AnyArray, Board, Bool
 
 WIDTHS = (1200, 600, 2400, 300)  #: longer sides of the reduced pictures, in the order in which they are tried
 X, Y, SIGMA, BLUR, LEVEL, HALF, MISFIT, EDGE1, EDGE2, PIXELS, DARK = range(11)  #: columns of a fit
@@ -73,8 +73,9 @@ def find(image: F32, weights: F64, saturated: Bool, board: Board, name: str, s: 
             raise CalibrationError(failure)
         seen = 0 if best is None else len(best.px)
         raise CalibrationError(
-            f"{name}: no board found ({seen} inner corners that fit a lattice; the board has {board.inner_corners[0]} x "
-            f"{board.inner_corners[1]}, at least {least} are needed); show more of it, in focus and evenly lit"
+            f"{name}: no board found ({seen} inner corners that fit a lattice; the board has "
+            f"{board.inner_corners[0]} x {board.inner_corners[1]}, at least {least} are needed); show more of it, "
+            "in focus and evenly lit"
         )
     if best.blur > s.max_blur * _square(best):
         raise CalibrationError(
@@ -121,7 +122,7 @@ def _refine(
 ) -> Corners:
     index, smooth = _trim(rough[0], board), rough[1]
     blur = float(np.clip(0.05 * np.median(np.hypot(*smooth.steps(index.astype(np.float64))[0].T)), 0.4, 3.0))
-    dark, why = 1, np.zeros(0, dtype=object)
+    dark, why = 1, np.zeros(0, dtype=np.object_)
     out = np.zeros((0, 11))
     points = index
     for turn in range(3):
@@ -133,10 +134,9 @@ def _refine(
         out = np.empty((len(points), 11))
         signs = dark * np.where(points.sum(1) % 2 == 0, 1.0, -1.0)
         clear = _clear(board, s, step1, step2)
-        k.fit_corners(
-            image, weights, start, step1, step2, _bend(at, smooth), blur, s.corner_reach, clear, signs, s.corner_radius, out
-        )
-        why = _judge(out, points, start, step1, step2, signs, saturated, image.shape, s)
+        window = s.corner_reach, clear, signs, s.corner_radius
+        k.fit_corners(image, weights, start, step1, step2, _bend(at, smooth), blur, *window, out)
+        why = _judge(out, start, (step1, step2), signs, saturated, s)
         good = why == ""
         if good.sum() < 4 or np.ptp(points[good], axis=0).min() < 1:
             raise CalibrationError(f"{name}: no board found: {int(good.sum())} corners could be fitted" + _summary(why))
@@ -156,7 +156,7 @@ def _refine(
     return Corners(points[good], fit[:, :2], fit[:, SIGMA], fit[:, LEVEL], fit[:, HALF], dark, blur, smooth, words)
 
 
-def _summary(why: Bool) -> str:
+def _summary(why: AnyArray) -> str:
     counts = Counter(str(w) for w in why if w)
     return "".join(f"; {n} {w}" for w, n in counts.most_common(3))
 
@@ -180,7 +180,7 @@ def _dark_sign(image: F32, at: F64, smooth: LatticeMap) -> int:
     """+1 if the squares whose offsets from even lattice points have one sign are the dark ones."""
     vote = 0.0
     for da, db in ((0.25, 0.25), (-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25)):
-        p = smooth(at + [da, db])
+        p = smooth(at + np.array([da, db]))
         x = np.clip(np.round(p).astype(int), 0, np.array(image.shape[::-1]) - 1)
         parity = np.where(at.sum(1) % 2 == 0, 1.0, -1.0)
         vote -= float((image[x[:, 1], x[:, 0]] * parity).sum()) * np.sign(da * db)
@@ -207,39 +207,56 @@ def _bend(at: F64, smooth: LatticeMap) -> F64:
     return out
 
 
+class _Verdicts:
+    """Why each of n fits is not used: a word each, empty as long as it is good; the first word counts."""
+
+    def __init__(self, n: int) -> None:
+        self.why: AnyArray = np.full(n, "", dtype=np.object_)
+
+    @property
+    def good(self) -> Bool:
+        return np.asarray(self.why == "", dtype=bool)
+
+    def because(self, bad: Bool, word: str) -> None:
+        self.why[bad & self.good] = word
+
+    def usual(self, values: F64, otherwise: float) -> float:
+        """Median over what is still good."""
+        return float(np.median(values[self.good])) if self.good.any() else otherwise
+
+
 def _judge(
-    out: F64, points: I32, start: F64, step1: F64, step2: F64, signs: F64, saturated: Bool, shape: tuple[int, ...], s: BoardSettings
-) -> F64:
-    """Why each fit is not used: an array of words, empty where it is good."""
-    square = np.minimum(np.hypot(*step1.T), np.hypot(*step2.T))
-    why = np.full(len(out), "", dtype=object)
-
-    def because(bad: Bool, word: str) -> None:
-        why[bad & (why == "")] = word
-
+    out: F64, start: F64, steps: tuple[F64, F64], signs: F64, saturated: Bool, s: BoardSettings
+) -> AnyArray:
+    """Why each fit (n, 11) is not used: words (n,), empty where it is good."""
+    v = _Verdicts(len(out))
+    square = np.minimum(*(np.hypot(*step.T) for step in steps))
+    size = np.array(saturated.shape[::-1])
     with np.errstate(all="ignore"):
+        margin = np.minimum(s.corner_reach * (np.abs(steps[0]) + np.abs(steps[1])), s.corner_radius) + 1
+        outside = (start - margin < 0).any(1) | (start + margin > size - 1).any(1)
         finite = np.isfinite(out[:, X])
-        margin = s.corner_reach * (np.abs(step1) + np.abs(step2)) + 1
-        margin = np.minimum(margin, s.corner_radius + 1)
-        outside = (start - margin < 0).any(1) | (start + margin > np.array(shape[::-1]) - 1).any(1)
-        because(~finite & outside, "too near the picture's border")
-        because(~finite, "no corner there")
-        because(np.hypot(*(out[:, :2] - start).T) > 0.25 * square, "no corner there")
-        because(out[:, DARK] != signs, "no corner there")
-        turned = [np.abs((out[:, c] - np.arctan2(st[:, 1], st[:, 0]) + np.pi / 2) % np.pi - np.pi / 2) for c, st in ((EDGE1, step1), (EDGE2, step2))]
-        because(np.maximum(*turned) > np.radians(12), "edges do not run along the board")
+        v.because(~finite & outside, "too near the picture's border")
+        v.because(~finite | (np.hypot(*(out[:, :2] - start).T) > 0.25 * square), "no corner there")
+        v.because(out[:, DARK] != signs, "no corner there")
+        turned = [_turned(out[:, edge], step) for edge, step in zip((EDGE1, EDGE2), steps, strict=True)]
+        v.because(np.maximum(*turned) > np.radians(12), "edges do not run along the board")
         contrast = out[:, HALF] / np.maximum(out[:, LEVEL], 1e-9)
-        usual = float(np.median(contrast[why == ""])) if (why == "").any() else 1.0
-        because((contrast < 0.5 * usual) | (out[:, LEVEL] <= 0), "low contrast")
+        v.because((contrast < 0.5 * v.usual(contrast, 1.0)) | (out[:, LEVEL] <= 0), "low contrast")
         misfit = out[:, MISFIT] / out[:, HALF]
-        typical = float(np.median(misfit[why == ""])) if (why == "").any() else 0.0
-        because(misfit > max(s.corner_misfit_factor * typical, s.corner_misfit), "does not look like a corner (shadow, highlight, dirt)")
-        blur = float(np.median(out[why == "", BLUR])) if (why == "").any() else 1.0
-        because(out[:, BLUR] > 3 * blur + 0.5, "blurred")
-        because(out[:, SIGMA] > 0.1 * square, "too noisy")
+        most = max(s.corner_misfit_factor * v.usual(misfit, 0.0), s.corner_misfit)
+        v.because(misfit > most, "does not look like a corner (shadow, highlight, dirt)")
+        v.because(out[:, BLUR] > 3 * v.usual(out[:, BLUR], 1.0) + 0.5, "blurred")
+        v.because(out[:, SIGMA] > 0.1 * square, "too noisy")
     if saturated.any():
         side = int(np.clip(np.median(square) * 0.6, 3, 301)) | 1
         share = cv2.blur(saturated.astype(np.float32), (side, side))
-        x = np.clip(np.round(start).astype(int), 0, np.array(shape[::-1]) - 1)
-        because(share[x[:, 1], x[:, 0]] > s.corner_saturated, "saturated")
-    return why
+        x = np.clip(np.round(start).astype(int), 0, size - 1)
+        v.because(share[x[:, 1], x[:, 0]] > s.corner_saturated, "saturated")
+    return v.why
+
+
+def _turned(angle: F64, step: F64) -> F64:
+    """Angle between fitted edges (n,) and the lattice's steps (n, 2), radians."""
+    d = angle - np.arctan2(step[:, 1], step[:, 0])
+    return np.asarray(np.abs((d + np.pi / 2) % np.pi - np.pi / 2))

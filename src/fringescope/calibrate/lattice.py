@@ -52,7 +52,7 @@ class LatticeMap:
 
     def inverse(self, px: F64) -> F64:
         """Lattice coordinates (n, 2) of pixels (n, 2); NaN where there are none."""
-        ij = apply(np.linalg.inv(self.H), px)
+        ij = apply(np.asarray(np.linalg.inv(self.H), dtype=np.float64), px)
         for _ in range(4 if len(self.powers) else 0):
             a, b = self.steps(ij)
             r = px - self(ij)
@@ -63,6 +63,12 @@ class LatticeMap:
         with np.errstate(invalid="ignore"):
             ij[~(np.abs(px - self(ij)).max(1) < 0.5)] = np.nan
         return ij
+
+
+def exponents(low: int, high: int) -> I32:
+    """Exponents (t, 2) of the monomials of two coordinates of total degree `low` to `high`."""
+    pairs = [(a, d - a) for d in range(low, high + 1) for a in range(d, -1, -1)]
+    return np.array(pairs, dtype=np.int32).reshape(-1, 2)
 
 
 def terms(x: F64, powers: I32) -> F64:
@@ -128,7 +134,7 @@ def fit_map(ij: F64, px: F64, sigma: F64 | None = None, rounds: int = 8) -> tupl
     n = len(ij)
     span = np.ptp(ij, axis=0)
     degree = 0 if n < 12 or span.min() < 2 else 2 if n < 40 or span.min() < 4 else 3 if n < 80 or span.min() < 6 else 4
-    powers = np.array([(a, d - a) for d in range(2, degree + 1) for a in range(d, -1, -1)], dtype=np.int32).reshape(-1, 2)
+    powers = exponents(2, degree)
     middle, half = 0.5 * (ij.min(0) + ij.max(0)), max(float(span.max()) / 2, 1.0)
     base = np.ones(n) if sigma is None else np.median(sigma) / np.maximum(sigma, 1e-9)
     w = base.copy()
@@ -187,17 +193,19 @@ def _links(s: Saddles) -> I32:
     """For each candidate and slot the candidate that it is linked to, and -1 where there is none: (n, 4)."""
     n = len(s)
     k = min(NEIGHBOURS, n)
-    distance, near = cKDTree(s.place).query(s.place, k=k)
+    found = cKDTree(s.place).query(s.place, k=k)
+    distance, near = np.asarray(found[0]), np.asarray(found[1])
     d = s.place[near] - s.place[:, None]
     bearing = np.arctan2(d[..., 1], d[..., 0])
-    swapped = (_apart(s.angle[near, 0], s.angle[:, None, 1], np.pi) < SWAP) & (_apart(s.angle[near, 1], s.angle[:, None, 0], np.pi) < SWAP)
+    first, second = s.angle[near, 0], s.angle[near, 1]
+    swapped = _apart(first, s.angle[:, None, 1], np.pi) < SWAP
+    swapped &= _apart(second, s.angle[:, None, 0], np.pi) < SWAP
     alike = (s.contrast[near] < 4 * s.contrast[:, None]) & (s.contrast[:, None] < 4 * s.contrast[near])
     slots = _slots(s)
     to = np.full((n, 4), -1, np.int32)
     for slot in range(4):
         ok = swapped & alike & (distance > 2.0) & (_apart(bearing, slots[:, None, slot], 2 * np.pi) < CONE)
-        first = np.argmax(ok, axis=1)
-        to[:, slot] = np.where(ok.any(1), near[np.arange(n), first], -1)
+        to[:, slot] = np.where(ok.any(1), near[np.arange(n), np.argmax(ok, axis=1)], -1)
     mutual = np.full_like(to, -1)
     for slot in range(4):
         has = np.flatnonzero(to[:, slot] >= 0)
@@ -248,7 +256,7 @@ def complete(s: Saddles, member: I32, index: I32, rounds: int = 12) -> tuple[I32
         ij = smooth.inverse(s.place)
         with np.errstate(invalid="ignore"):
             at = np.round(ij)
-            near = np.abs(ij - at).max(1) < NEAR
+            near: Bool = np.asarray(np.abs(ij - at).max(1) < NEAR)
         near &= _same_look(s, smooth, ij, at, parity)
         near[member] = False
         near &= _beside(at, index, 2.0)
@@ -285,7 +293,7 @@ def _bright_after_x(s: Saddles, smooth: LatticeMap, ij: F64, which: I32) -> I32:
 
 def _same_look(s: Saddles, smooth: LatticeMap, ij: F64, at: F64, parity: int) -> Bool:
     """Whether the edges of candidates run along the lattice there, with the colours that it has there."""
-    ok = np.isfinite(ij).all(1)
+    ok: Bool = np.asarray(np.isfinite(ij).all(1))
     which = np.flatnonzero(ok).astype(np.int32)
     a, b = smooth.steps(ij[which])
     along = np.column_stack([np.arctan2(v[:, 1], v[:, 0]) for v in (a, b)])

@@ -14,7 +14,7 @@ from fringescope.calibrate.numbering import QUARTER, Turn
 from fringescope.errors import CalibrationError
 from fringescope.types import F32, I32, U8, Board
 
-OTHERS = tuple(f"DICT_{n}X{n}_{m}" for n in (4, 5, 6, 7) for m in (50, 100, 250, 1000)) + ("DICT_ARUCO_ORIGINAL",)
+OTHERS = (*(f"DICT_{n}X{n}_{m}" for n in (4, 5, 6, 7) for m in (50, 100, 250, 1000)), "DICT_ARUCO_ORIGINAL")
 
 
 def dictionary(name: str) -> Any:
@@ -25,13 +25,13 @@ def dictionary(name: str) -> Any:
 
 
 def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, tuple[str, ...]]:
-    """The numbering that the markers tell. Raises CalibrationError if there are none, or others than board.json says."""
+    """The numbering that the markers tell. Raises CalibrationError if there are none or others than board.json says."""
     words = dictionary(board.dictionary)
     where = _positions(board)
     seen = _read(found, image, board, words)
     votes = _votes(seen, where)
     if not votes:
-        raise CalibrationError(_why_none(found, image, board, name, where))
+        raise CalibrationError(_why_none(found, image, board, name))
     (best, count), *rest = votes.most_common(2)
     turn = _turn(best)
     notes = []
@@ -55,7 +55,7 @@ def _on_board(turn: Turn, found: Corners, board: Board) -> bool:
 
 
 def _positions(board: Board) -> list[dict[int, tuple[int, int]]]:
-    """Square of each marker: as OpenCV counts them, and as it did before 4.6 where that differs (a white first square)."""
+    """Square of each marker: as OpenCV counts them, and as it did before 4.6 (a white first square)."""
     out = []
     for odd in (1, 0):
         white = [(c, r) for r in range(board.squares[1]) for c in range(board.squares[0]) if (c + r) % 2 == odd]
@@ -88,7 +88,8 @@ def _bits(found: Corners, image: F32, board: Board, square: I32, cells: int) -> 
     fine = 3
     t = ((np.arange(cells * fine) + 0.5) / (cells * fine) - 0.5) * share
     x, y = np.meshgrid(t, t)
-    p = found.smooth(square - 0.5 + np.column_stack([x.ravel(), y.ravel()])).astype(np.float32)
+    at = np.asarray(square, dtype=np.float64) - 0.5 + np.column_stack([x.ravel(), y.ravel()])
+    p = found.smooth(at).astype(np.float32)
     if (p < 1).any() or (p > np.array(image.shape[::-1]) - 2).any():
         return None
     v = cv2.remap(image, p[:, :1], p[:, 1:], cv2.INTER_LINEAR).reshape(cells, fine, cells, fine).mean((1, 3))
@@ -120,7 +121,7 @@ def _turn(vote: tuple[int, int, int]) -> Turn:
     return Turn(R, np.array(vote[1:], dtype=np.int32))
 
 
-def _why_none(found: Corners, image: F32, board: Board, name: str, where: list[dict[int, tuple[int, int]]]) -> str:
+def _why_none(found: Corners, image: F32, board: Board, name: str) -> str:
     if len(_read(found, image, board, dictionary(board.dictionary), mirrored=True)) >= 2:
         return f"{name}: the markers are mirrored: the camera's pictures are flipped; turn the flip off"
     counts = {n: len(_read(found, image, board, dictionary(n))) for n in OTHERS if hasattr(cv2.aruco, n)}

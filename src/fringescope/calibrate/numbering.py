@@ -14,6 +14,7 @@ from fringescope.errors import CalibrationError
 from fringescope.types import F32, F64, I32, Board, Bool, Sighting
 
 AGREE = 0.35  #: squares: cameras whose projector coordinates differ less than this see the same numbering
+OPEN = "numberings fit"  #: in the words of a sighting whose numbering is not settled
 QUARTER = np.array([[0, -1], [1, 0]])  #: a quarter turn of the lattice
 
 
@@ -23,6 +24,11 @@ class Turn:
 
     R: I32
     t: I32
+
+    @property
+    def stays(self) -> bool:
+        """Whether it changes nothing."""
+        return not (self.R - np.eye(2)).any() and not self.t.any()
 
     def corner(self, index: I32) -> I32:
         """Board indices of corners (n, 2)."""
@@ -73,12 +79,11 @@ def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, t
                 "check the number of squares in board.json"
             )
     chosen = black_first or fitting
-    offsets = {tuple(t.t) for t in chosen} if len(chosen) > 2 else set()
-    words = ()
-    if offsets:
-        words = (f"{extent[0]} x {extent[1]} of {board.inner_corners[0]} x {board.inner_corners[1]} inner corners are in "
-                 f"view: {len(chosen)} numberings fit",)  # fmt: skip
-    return min(chosen, key=lambda t: _untidiness(t, found, board)), words
+    best = min(chosen, key=lambda t: _untidiness(t, found, board))
+    if len(chosen) <= 2:
+        return best, ()
+    of = f"{board.inner_corners[0]} x {board.inner_corners[1]}"
+    return best, (f"{extent[0]} x {extent[1]} of {of} inner corners are in view: {len(chosen)} {OPEN}",)
 
 
 def _untidiness(t: Turn, found: Corners, board: Board) -> tuple[float, ...]:
@@ -161,75 +166,83 @@ def _other_board(extent: I32, board: Board, name: str) -> str:
     )
 
 
-# ------------------------------------------------------------------------------------------------- cameras among themselves
+# --------------------------------------------------------------------------------------------- cameras among themselves
 
 
 def agree(sightings: Sequence[Sighting], board: Board) -> tuple[Sighting, ...]:
     """The sightings of one pose, renumbered so that all cameras call a corner the same.
 
-    The projector's coordinate at the white squares of the sighting with the most of them foretells that of the others;
-    among all quarter turns and offsets that the board and its colours allow, each takes the one that fits. A sighting
-    that fits in no way, or in more than one, keeps its numbering and says so in its words.
+    The projector's coordinate at the corners, from the samples' phases, of the surest sighting foretells that of the
+    others; among all quarter turns and offsets that the board and its colours allow, each takes the one that fits. A
+    sighting that fits in no way keeps its numbering and says so in its words, as does one without two directions.
     """
     if len(sightings) < 2:
         return tuple(sightings)
-    order = sorted(range(len(sightings)), key=lambda n: -_weight(sightings[n], board))
+    seen = [_corner_uv(s) for s in sightings]
+    order = sorted(range(len(sightings)), key=lambda n: (seen[n] is None, *_doubt(sightings[n])))
     first = sightings[order[0]]
-    if len(first.square) < 4:
+    uv = seen[order[0]]
+    if uv is None:
         return tuple(sightings)
     out = {order[0]: first}
-    squares, uv = first.square, first.square_uv
+    index = first.corner
     for n in order[1:]:
-        out[n] = _renumber(sightings[n], squares, uv, first, board)
-        if out[n].words == sightings[n].words and len(out[n].square):
-            squares, uv = np.concatenate([squares, out[n].square]), np.concatenate([uv, out[n].square_uv])
+        other = seen[n]
+        if other is None:
+            word = f"the projector's phases do not tell whether the numbering is that of {first.camera}"
+            out[n] = replace(sightings[n], words=(*sightings[n].words, word))
+            continue
+        out[n], fits = _renumber(sightings[n], other, index, uv, first.camera, board)
+        if fits:
+            index, uv = np.concatenate([index, out[n].corner]), np.concatenate([uv, other])
     return tuple(out[n] for n in range(len(sightings)))
 
 
-def _weight(s: Sighting, board: Board) -> float:
-    full = len(s.corner) / (board.inner_corners[0] * board.inner_corners[1])
-    sure = not any("numberings fit" in w for w in s.words)
-    return len(s.square) * (2.0 if sure else 1.0) + full
+def _doubt(s: Sighting) -> tuple[bool, int]:
+    """Sorts the surest sighting first: numbering not in doubt, then many corners."""
+    return any(OPEN in w for w in s.words), -len(s.corner)
 
 
-def _renumber(s: Sighting, squares: I32, uv: F64, first: Sighting, board: Board) -> Sighting:
-    if len(s.square) < 3:
-        return replace(s, words=(*s.words, f"too few white squares to compare the numbering with {first.camera}"))
-    H = homography(squares - 0.5, uv)
-    unit = _square_units(H, squares)
+def _corner_uv(s: Sighting) -> F64 | None:
+    """Projector coordinates (n, 2) at the corners, to a fraction of a square; None where the samples do not tell."""
+    g = s.directions
+    if len(g) < 2 or np.linalg.matrix_rank(g, tol=1e-3 * float(np.abs(g).max())) < 2 or len(s.corner) < 4:
+        return None
+    ok = np.isfinite(s.sample_phase).all(1)
+    px = s.sample_px[ok]
+    if len(px) < 12 or np.linalg.matrix_rank(px - px.mean(0), tol=1.0) < 2:
+        return None
+    uv = s.sample_phase[ok] / (2 * np.pi) @ np.linalg.pinv(g).T
+    return apply(homography(px, uv), s.corner_px)
+
+
+def _renumber(
+    s: Sighting, seen: F64, index: I32, uv: F64, first: str, board: Board
+) -> tuple[Sighting, bool]:
+    """A sighting in the numbering of corners `index` (n, 2) seen at `uv` (n, 2), and whether one fits."""
+    H = homography(index.astype(np.float64), uv)
+    middle = index.mean(0)
+    p = apply(H, middle + np.array([(0, 0), (1, 0), (0, 1)]))
+    unit = float(np.sqrt(abs(np.linalg.det(p[1:] - p[0])))) or 1.0
     ranked = []
     for t in turns(s.corner, board.inner_corners):
-        if not _colours_stay(t, board):
-            continue
-        square = t.square(s.square)
-        off = np.hypot(*((apply(H, square - 0.5) - s.square_uv) / unit).T)
-        ranked.append((float(np.median(off)), t))
+        if _colours_stay(t, board):
+            off = np.hypot(*((apply(H, t.corner(s.corner).astype(np.float64)) - seen) / unit).T)
+            ranked.append((float(np.median(off)), t))
     ranked.sort(key=lambda r: r[0])
     if not ranked or not ranked[0][0] < AGREE:
         off = ranked[0][0] if ranked else float("nan")
-        return replace(
-            s,
-            words=(
-                *s.words,
-                f"numbering does not agree with {first.camera}: {off:.1f} squares off; pictures of another pose or camera?",
-            ),
-        )
+        word = f"numbering does not agree with {first} ({off:.1f} squares off): another pose or camera?"
+        return replace(s, words=(*s.words, word)), False
     t = ranked[0][1]
-    words = tuple(w for w in s.words if "numberings fit" not in w)
-    if (t.R == np.eye(2)).all() and (t.t == 0).all() and words == s.words:
-        return s
-    return replace(s, corner=t.corner(s.corner), square=t.square(s.square), words=words)
-
-
-def _square_units(H: F64, squares: I32) -> float:
-    """Projector-plane units per square in the middle of the board."""
-    c = squares.mean(0) - 0.5
-    p = apply(H, np.array([c, c + [1, 0], c + [0, 1]]))
-    return float(np.sqrt(abs(np.linalg.det(p[1:] - p[0])))) or 1.0
+    words = tuple(w for w in s.words if OPEN not in w)
+    if t.stays and words == s.words:
+        return s, True
+    return replace(s, corner=t.corner(s.corner), square=t.square(s.square), words=words), True
 
 
 def _colours_stay(t: Turn, board: Board) -> bool:
     """Whether black squares stay black; boards with markers do not turn at all."""
     if board.dictionary:
-        return bool((t.R == np.eye(2)).all() and (t.t == 0).all())
+        return t.stays
     return not board.ends_differ or bool(t.square(np.zeros((1, 2), np.int32)).sum() % 2 == 0)

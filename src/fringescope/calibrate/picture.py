@@ -21,7 +21,7 @@ def equalise(image: F32, pixel_format: PixelFormat) -> tuple[F32, F64]:
         return np.ascontiguousarray(image, dtype=np.float32), np.ones((2, 2))
     h, w = (image.shape[0] // 2) * 2, (image.shape[1] // 2) * 2
     sites = {(i, j): image[i:h:2, j:w:2].astype(np.float64) for i in (0, 1) for j in (0, 1)}
-    mean = sum(sites.values()) / 4
+    mean = np.mean(list(sites.values()), axis=0)
     smooth = cv2.blur(mean, (3, 3))
     spread = cv2.dilate(mean, np.ones((3, 3))) - cv2.erode(mean, np.ones((3, 3)))
     high = float(np.percentile(smooth, 99))

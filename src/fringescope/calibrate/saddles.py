@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from fringescope.kernels import corners as k
-from fringescope.types import F32, F64
+from fringescope.types import F32, F64, Bool
 
 RINGS = (3.5, 5.5)  #: radii in pixels, both of which must show four sectors
 MOST = 6000  #: candidates that are looked at, strongest first
@@ -71,6 +71,6 @@ def _rings(smooth: F32, place: F64, radius: float) -> F64:
     return out
 
 
-def _agree(a: F64, b: F64, degrees: float = 25.0) -> F64:
+def _agree(a: F64, b: F64, degrees: float = 25.0) -> Bool:
     d = np.abs((a - b + np.pi / 2) % np.pi - np.pi / 2)
     return np.asarray((d < np.radians(degrees)).all(1))

@@ -25,7 +25,7 @@ def see(
     s = s or BoardSettings()
     name = f"{pose}/{plan.camera}"
     if image.shape != decoded.shape:
-        raise CalibrationError(f"{name}: picture {image.shape} and phases {decoded.shape} differ in size; needed one size")
+        raise CalibrationError(f"{name}: picture {image.shape}, phases {decoded.shape}; needed one size")
     even, weights = equalise(np.ascontiguousarray(image, dtype=np.float32), plan.pixel_format)
     saturated = (decoded.reasons & int(Reason.SATURATED)) != 0
     found = corners.find(even, weights, saturated, board, name, s)
@@ -52,7 +52,7 @@ def see(
 
 
 def _not_mirrored(px: F64, uv: F64, name: str) -> None:
-    """Raise CalibrationError if the projector's plane runs mirrored in the picture: both look at one side of the board."""
+    """Raise CalibrationError if the projector's plane runs mirrored in the picture: both look at one side of it."""
     if len(px) < 4 or np.linalg.matrix_rank(px - px.mean(0), tol=1.0) < 2:
         return
     H = homography(px, uv)
@@ -61,6 +61,6 @@ def _not_mirrored(px: F64, uv: F64, name: str) -> None:
     p = q[:, :2] / q[:, 2:]
     if np.linalg.det(p[1:] - p[0]) < 0:
         raise CalibrationError(
-            f"{name}: the projector's coordinates run mirrored in this picture; the camera's pictures are mirrored or the "
-            "projector shows its patterns mirrored: turn the flip off"
+            f"{name}: the projector's coordinates run mirrored in this picture; the camera's pictures are mirrored or "
+            "the projector shows its patterns mirrored: turn the flip off"
         )

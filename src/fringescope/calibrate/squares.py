@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from fringescope.calibrate.corners import Corners
+from fringescope.calibrate.lattice import exponents
 from fringescope.calibrate.lattice import terms as monomials
 from fringescope.settings import BoardSettings
 from fringescope.types import F32, F64, I32, Board, Bool, Decoded, Reason
@@ -155,7 +156,7 @@ def _white(block: F32, found: Corners, clear: float) -> Bool:
     return np.asarray(cv2.erode(bright, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
 
 
-# ---------------------------------------------------------------------------------------------- orders of the whole board
+# -------------------------------------------------------------------------------------------- orders of the whole board
 
 
 def _settle(areas: list[Area], found: Corners) -> tuple[list[Area], int, int]:
@@ -164,7 +165,8 @@ def _settle(areas: list[Area], found: Corners) -> tuple[list[Area], int, int]:
         return areas, 0, 0
     out = [Area(a.square, a.px, a.phase.copy(), a.sigma.copy()) for a in areas]
     repaired = dropped = 0
-    lattice = np.split(found.smooth.inverse(np.concatenate([a.px for a in out])), np.cumsum([len(a.px) for a in out])[:-1])
+    every = found.smooth.inverse(np.concatenate([a.px for a in out]))
+    lattice = np.split(every, np.cumsum([len(a.px) for a in out])[:-1])
     for d in range(areas[0].phase.shape[1]):
         thin = [np.arange(0, len(a.px), len(a.px) // 40 + 1) for a in out]
         x = np.concatenate([ij[t] for ij, t in zip(lattice, thin, strict=True)])
@@ -191,7 +193,7 @@ class _Polynomial:
 
     def __init__(self, x: F64, degree: int) -> None:
         self.middle, self.half = np.median(x, 0), max(float(np.ptp(x, axis=0).max()) / 2, 1e-9)
-        self.powers = np.array([(a, d - a) for d in range(degree + 1) for a in range(d, -1, -1)], dtype=np.int32)
+        self.powers = exponents(0, degree)
         self.value = np.zeros(len(self.powers))
 
     def terms(self, x: F64) -> F64:
@@ -205,7 +207,7 @@ def _least_squares(A: F64, y: F64, w: F64) -> tuple[F64, F64]:
     """Weighted least squares by the normal equations (columns of order 1): solution and its covariance."""
     N = (A * w[:, None]).T @ A
     N[np.diag_indices_from(N)] += 1e-12 * np.trace(N) / len(N)
-    C = np.linalg.inv(N)
+    C = np.asarray(np.linalg.inv(N), dtype=np.float64)
     return C @ (A.T @ (w * y if y.ndim == 1 else w[:, None] * y)), C
 
 
@@ -225,7 +227,7 @@ def _board_phase(x: F64, y: F64) -> _Polynomial:
     return p
 
 
-# ----------------------------------------------------------------------------------------------------- one square's phase
+# --------------------------------------------------------------------------------------------------- one square's phase
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +284,7 @@ def _usual(rough: list[F64]) -> F64:
     return out
 
 
-# ------------------------------------------------------------------------------------------------------------- the outcome
+# ---------------------------------------------------------------------------------------------------------- the outcome
 
 
 def _centres(chosen: list[tuple[Area, _Fit]], found: Corners, g: F64) -> tuple[I32, F64, F64, F64]:
@@ -314,7 +316,7 @@ def centre(found: Corners, square: I32) -> tuple[F64, float]:
     """Where the diagonals of a lattice square cross, pixels (2,), and the standard deviation of each: the smooth map,
     corrected by the corners around it.
     """
-    at = square - 0.5
+    at = np.asarray(square, dtype=np.float64) - 0.5
     d = found.index - at
     near = np.abs(d).max(1) < 2.0
     d, miss = d[near], found.px[near] - found.smooth(found.index[near].astype(np.float64))

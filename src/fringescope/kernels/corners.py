@@ -25,7 +25,7 @@ def bilinear(image, x, y):
     )
 
 
-@by_rows(lambda image, place, *_: place.shape[0])
+@by_rows(lambda _image, place, *_: place.shape[0])
 def ring_tests(first, last, image, place, radius, out):
     """How much each place (n, 2) looks like a chequer corner on a circle around it.
 
@@ -37,8 +37,7 @@ def ring_tests(first, last, image, place, radius, out):
     ring = np.empty(count)
     cross = np.empty(4)
     for n in range(first, last):
-        out[n, 2] = 0.0
-        out[n, 3] = 0.0
+        out[n, :] = 0.0
         for k in range(count):
             t = 2.0 * math.pi * k / count
             ring[k] = bilinear(image, place[n, 0] + radius * math.cos(t), place[n, 1] + radius * math.sin(t))
@@ -139,8 +138,8 @@ def fit_corner(image, weights, start, step1, step2, bend1, bend2, blur, reach, c
     det = step1[0] * step2[1] - step1[1] * step2[0]
     half_x = min(radius, reach * (abs(step1[0]) + abs(step2[0])))
     half_y = min(radius, reach * (abs(step1[1]) + abs(step2[1])))
-    x0, x1 = int(math.ceil(start[0] - half_x)), int(math.floor(start[0] + half_x))
-    y0, y1 = int(math.ceil(start[1] - half_y)), int(math.floor(start[1] + half_y))
+    x0, x1 = math.ceil(start[0] - half_x), math.floor(start[0] + half_x)
+    y0, y1 = math.ceil(start[1] - half_y), math.floor(start[1] + half_y)
     if not abs(det) > 1.0 or x0 < 0 or y0 < 0 or x1 >= W or y1 >= H:
         return
     p = np.zeros(TERMS)
@@ -240,7 +239,7 @@ def fit_corner(image, weights, start, step1, step2, bend1, bend2, blur, reach, c
     out[10] = 1.0 if best[11] > 0.0 else -1.0  # sign of a b in the dark squares
 
 
-@by_rows(lambda image, weights, start, *_: start.shape[0])
+@by_rows(lambda _image, _weights, start, *_: start.shape[0])
 def fit_corners(first, last, image, weights, start, step1, step2, bend, blur, reach, clear, dark, radius, out):
     """Fit blurred chequer corners: two crossing edges, low-order light (offset of degree 2, contrast of degree 1).
 
