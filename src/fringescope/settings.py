@@ -215,6 +215,7 @@ class ResponseSettings(_Section):
     negligible_rad: float = knob(0.005, "rad", "a phase error that need not be corrected in the sets that measure", "", 0)
     harmful_rad: float = knob(0.1, "rad", "a phase error that endangers orders, and is corrected, in the sets that only settle them", "", 0)
     significance: float = knob(4.0, "sigma", "evidence that a correction needs", "", 0)
+    min_explained: float = knob(0.1, "", "share of the disagreement, in parts of the picture that it was not fitted to, that a correction must take away", "", 0, 1)
     max_sigma_rad: float = knob(0.15, "rad", "pixels whose phase is noisier than this tell nothing of the response", "", 0.001)
     min_contrast: float = knob(0.1, "", "least modulation, as a share of the background, of pixels that tell of the response", "", 0, 1)
     min_pixels: int = knob(400, "pixels", "fewest pixels that tell of the response", "", 50)

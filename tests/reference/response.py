@@ -11,7 +11,7 @@ def correct(phase, sigma, steps, table, slope):  # type: ignore[no-untyped-def]
     """See the kernel."""
     out, out_sigma = np.array(phase), np.array(sigma)
     n = len(table)
-    for index, p in np.ndenumerate(phase):
+    for index, p in np.ndenumerate(np.asarray(phase, np.float64)):
         if not math.isfinite(p):
             continue
         x = math.fmod(p * steps / (2 * math.pi) + 1000.0, 1.0) * n

@@ -98,15 +98,15 @@ def _conclude(pixels: Pixels, s: ResponseSettings, levels: tuple[float, float], 
         len(pixels) or int(sum(t.block.size for t in pixels.triples)),
         pixels.saturated,
     )
-    blown = pixels.saturated > BLOWN
-    needed = not blown and any(_needs(found, o, _measures(o, pixels.sets), s) for o in pixels.sets)
+    verdict = _judge(found, pixels, s)
     figures: dict[str, Any] = {
+        "verdict": verdict,
         "explained": found.explained,
         "sets": {str(n): {"error_rad": e, "sigma_rad": d} for n, (e, d) in sets.items()},
         "pairs": list(_pairs_figures(pixels, replace(response, needed=True))),
         "smooth_surface_assumed": bool(pixels.triples),
     }
-    response = replace(response, needed=needed, figures=figures)
+    response = replace(response, needed=verdict == "needed", figures=figures)
     return replace(response, words=tuple(words(response, sets, s)))
 
 
@@ -130,10 +130,16 @@ def _error(found: Fit, steps: int, frequency: float) -> tuple[float, float]:
     return greatest(found.h), math.sqrt(max(float(grad @ found.h_cov @ grad), 0.0))
 
 
-def _needs(found: Fit, o: Observed, measures: bool, s: ResponseSettings) -> bool:
-    error, sigma = _error(found, o.steps, o.frequency)
-    floor = s.negligible_rad if measures else s.harmful_rad
-    return error > floor and error > s.significance * sigma and found.explained > 0
+def _judge(found: Fit, pixels: Pixels, s: ResponseSettings) -> str:
+    """ "needed" where a set's error is too large and proved, "unproved" where it is not proved, else "fine"."""
+    verdict = "fine"
+    for o in pixels.sets:
+        error, sigma = _error(found, o.steps, o.frequency)
+        if error <= (s.negligible_rad if _measures(o, pixels.sets) else s.harmful_rad):
+            continue
+        proved = error > s.significance * sigma and found.explained > s.min_explained and pixels.saturated <= BLOWN
+        verdict = "needed" if proved else "unproved" if verdict == "fine" else verdict
+    return verdict
 
 
 def _pairs_figures(pixels: Pixels, response: Response) -> Iterable[Mapping[str, Any]]:
@@ -170,7 +176,6 @@ def words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSetti
         f"{100 * r.sigmas[0]:.2f} % of the fringe"
     )
     told = ", ".join(f"{e:.4f} +- {d:.4f} rad at N = {n}" for n, (e, d) in sets.items())
-    worst, sigma = max(sets.values())
     fair = [n for n, e in r.error_rad.items() if e < s.negligible_rad]
     if r.needed:
         yield f"needs correction: {told}; give this response to reconstruct and decode"
@@ -178,7 +183,7 @@ def words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSetti
         yield f"or do without: draw the patterns through the table 'predistortion'{more}"
     elif r.saturated > BLOWN:
         yield f"nothing is proved: most of what is lit saturates; the rest says {told}"
-    elif worst > s.negligible_rad and worst <= s.significance * sigma:
+    elif r.figures.get("verdict") == "unproved":
         yield f"nothing is proved: {told}; more light, or a larger and plainer surface, would tell"
     else:
         yield f"needs no correction: {told}"

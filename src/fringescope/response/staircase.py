@@ -74,7 +74,11 @@ def from_staircase(
         saturated,
         bool(needed),
         (),
-        {"levels": (x * full_scale).tolist(), "seen": shape.tolist()},
+        {
+            "verdict": "needed" if needed else "unproved" if errors[worst] > s.negligible_rad else "fine",
+            "levels": (x * full_scale).tolist(),
+            "seen": shape.tolist(),
+        },
     )
     return replace(r, words=tuple(words(r, {n: (e, scatter[n]) for n, e in errors.items()}, s)))
 
