@@ -169,12 +169,15 @@ def _judge_tilt(w: Words, calibration: Calibration, covered: tuple[Coverage, ...
     enough = np.tan(np.radians(s.min_tilt_deg))
     spread = np.degrees(np.arctan(np.sqrt(np.linalg.eigvalsh(np.cov(way.T))[0]))) if len(way) > 2 else 0.0
     missing = [name for name, d in directions(calibration) if (way @ d).max() < enough]
-    if spread < 0.5 * s.min_tilt_deg:
-        w.against(f"the boards are nearly parallel in one direction (spread {spread:.1f} degrees)")
+    parallel = bool(spread < 0.5 * s.min_tilt_deg)
+    if parallel:
+        w.against(f"the tilts all lie near one line (spread across it {spread:.1f} degrees)")
+        if not missing:
+            w.next.append("tilt the board to more sides, not only along one line of the tilts drawn below")
     if missing:
         shown = " or ".join(missing[:4])
         w.next.append(f"no pose tilted {shown}: tilt the board there by 20 to 30 degrees")
-    return not missing
+    return not (missing or parallel)
 
 
 def _judge_depth(w: Words, calibration: Calibration, s: EvidenceSettings) -> bool:

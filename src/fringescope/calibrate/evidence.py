@@ -63,6 +63,8 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
     _judge_prediction(w, predicted, footprint, s)
     _judge_poses(w, calibration, s)
     coverage.judge(w, calibration, covered, s)
+    for word in _said(calibration):
+        w.against(word, 0)
     pairs = correlations(calibration, s.tight_correlation)
     return Evidence(
         w.verdict,
@@ -76,6 +78,12 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
         predicted,
         figures,
     )
+
+
+def _said(calibration: Calibration) -> list[str]:
+    """What the solve itself says of the pictures."""
+    words = calibration.figures.get("words", ())
+    return [words] if isinstance(words, str) else [str(w) for w in words]
 
 
 # ------------------------------------------------------------------------------------------------------------- figures
@@ -194,10 +202,13 @@ def _judge_residuals(w: _Words, fields: Sequence[FieldTest], s: EvidenceSettings
     if corners and max(f.rms for f in corners) <= s.max_corner_px:
         ends = min(f.rms for f in corners), max(f.rms for f in corners)
         spread = " to ".join(dict.fromkeys(f"{v:.2g}" for v in ends))
-        more = f", the projected phase to {phase[0].rms:.2g} of the projector's pixels" if phase else ""
+        more = f", the projected phase to {phase[0].rms:.2g} units of the projector's plane" if phase else ""
         w.good.append(f"Corners fit to {spread} px{more}.")
     if fields and not any("repeat over" in t or "centrosymmetric" in t for t in w.weak):
-        w.good.append("Residuals scatter evenly about zero: no pattern over any image that repeats from pose to pose.")
+        few = min(f.sightings for f in fields)
+        told = f", as far as {few} poses can tell" if 2.0 ** (1 - few) > s.max_p else ""
+        w.good.append("Residuals scatter evenly about zero: no pattern over any image that repeats from pose to pose"
+                      f"{told}.")  # fmt: skip
     if not phase:
         w.against("no projected phase was used: nothing ties the projector", 2)
 
@@ -214,12 +225,13 @@ def _judge_held_out(
         w.against(f"boards that were not used are measured {1000 * mm:.0f} um off ({mm / footprint:.1f} pixels)", level)
     elif np.isfinite(mm):
         w.good.append(f"Boards that were not used are measured to {_um(1000 * mm)}"
-                      f"{f', their size to {scale:.0f} ppm' if np.isfinite(scale) else ''}.")  # fmt: skip
+                      f"{f', their size to {scale:.0f} ppm' if scale <= s.max_scale_ppm else ''}.")  # fmt: skip
     if px > s.max_held_out * figures["corners rms px"]:
         w.against(f"boards that were not used fit {px / figures['corners rms px']:.1f} times worse than those used")
         w.next.append("take more poses: the solve leans on single ones")
     if scale > s.max_scale_ppm:
-        w.against(f"the size of a board that was not used comes out {scale / 1e4:.2f} % off")
+        off = max(held_out, key=lambda h: np.nan_to_num(abs(h.scale - 1)))
+        w.against(f"the board of {off.pose}, when it is not used, comes out {scale / 1e4:.2f} % off in size")
     worst = max(held_out, key=lambda h: np.nan_to_num(h.corner_px_rms))
     if len(held_out) > 2 and worst.corner_px_rms > 3 * np.nanmedian([h.corner_px_rms for h in held_out]):
         w.against(f"{worst.pose} fits {worst.corner_px_rms:.2g} px when it is left out, the others far better", 0)
