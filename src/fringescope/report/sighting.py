@@ -23,7 +23,7 @@ def sighting_picture(image: NDArray[Any], sighting: Sighting, residuals: Residua
 
     Yellow rings: corners, joined row by row from the first (white disc; its arrows are the board's x, red, and y,
     green). Green diamonds: white squares. Blue dots: phase samples. Red crosses: left out by the solve, where
-    `residuals` are given; purple lines then show the corners' residuals, drawn 200 times too long.
+    `residuals` are given; purple lines then show the corners' residuals, so much too long that they can be seen.
     """
     grey = _grey(image)
     k = LONGEST / max(grey.shape)
@@ -47,10 +47,11 @@ def sighting_picture(image: NDArray[Any], sighting: Sighting, residuals: Residua
             _cross(out, p, 1.3 * r, max(1, round(2 * unit)))
         else:
             cv2.circle(out, _point(p), int(r * 2**SHIFT), CORNER, max(1, round(1.4 * unit)), cv2.LINE_AA, SHIFT)
-    if residuals is not None and residuals.corner.shape == corners.shape:
-        for p, d in zip(corners, residuals.corner, strict=True):
-            if np.isfinite(d).all():
-                cv2.line(out, _point(p), _point(p + 200 * k * d), MISS, max(1, round(unit)), cv2.LINE_AA, SHIFT)
+    if residuals is not None and residuals.corner.shape == corners.shape and not left_out[0].all():
+        d = residuals.corner[~left_out[0]]
+        times = 0.4 * step / max(float(np.percentile(np.hypot(*d.T), 90)), 1e-9)
+        for p, q in zip(corners[~left_out[0]], times * d, strict=True):
+            cv2.line(out, _point(p), _point(p + q), MISS, max(1, round(unit)), cv2.LINE_AA, SHIFT)
     _axes(out, sighting.corner, corners, step, unit)
     return np.asarray(out, dtype=np.uint8)
 
