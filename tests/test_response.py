@@ -233,7 +233,7 @@ def test_wrong_orders_and_two_directions_do_not_mislead(rng: np.random.Generator
 
 
 def test_noise_alone_is_no_evidence() -> None:
-    d = decoded(draw([((1 / 300, 0.0), 3), ((1 / 60, 0.0), 3)], linear, noise=4.0, bright=60.0, size=(60, 120)))
+    d = decoded(draw([((1 / 920, 0.0), 3), ((1 / 100, 0.0), 3)], linear, noise=4.0, bright=60.0, size=(60, 120)))
     r = response.from_sets(d, replace(SMALL, max_sigma_rad=0.4))
     assert not r.needed
 

@@ -27,6 +27,7 @@ from fringescope.types import F64, Bool
 
 ORDERS = 11  #: harmonics h_2 .. h_12 that the equations hold
 ROUNDS = 20
+LIKE = 0.5  #: periods nearer than this ratio keep their orders under any response
 GRID = 2048  #: entries of a table over one ripple
 CONVERGED = 3e-5  #: change of a harmonic
 EFFECT = 30.0  #: by how much alike neighbouring pixels are at first taken to be
@@ -136,6 +137,12 @@ def _true(h: F64, steps: int, phase: F64) -> F64:
     return np.asarray(phase + np.interp(at, np.arange(len(add) + 1), np.append(add, add[0])))
 
 
+def _nearest_order(x: F64, ratio: float) -> F64:
+    """A pair's disagreement after the fine set's order that makes it least: a strong response spoils orders, too."""
+    turn = 2 * np.pi * abs(ratio)
+    return x if abs(ratio) > 0.95 else np.asarray(x - turn * np.rint(x / turn))
+
+
 def _wrap(x: F64) -> F64:
     return np.asarray(x - 2 * np.pi * np.rint(x / (2 * np.pi)))
 
@@ -145,7 +152,7 @@ def disagreement(pair: Pair, sets: tuple[Observed, ...], h_other: F64 | None, h_
     other, fine = sets[pair.other], sets[pair.fine]
     a = other.phase if h_other is None else _true(h_other, other.steps, other.phase)
     b = pair.fine_phase if h_fine is None else _true(h_fine, fine.steps, pair.fine_phase)
-    return _wrap(a - pair.ratio * b)
+    return _nearest_order(_wrap(a - pair.ratio * b), pair.ratio)
 
 
 def _pair_equations(
@@ -155,11 +162,15 @@ def _pair_equations(
     o, f = pixels.sets[pair.other], pixels.sets[pair.fine]
     of, ff = ripples[pair.other], ripples[pair.fine]
     fine = ff.at(ff.true(pair.fine_phase))
-    other = of.at(pair.ratio * fine.phi)
     r = pair.ratio
+    phi = r * fine.phi
+    phase = _wrap(of.true(o.phase) - phi)
+    phi += phase - _nearest_order(phase, r)
+    other = of.at(phi)
     moved = -fine.error_by / np.maximum(fine.slope, 0.05)  # d(phi of the fine set) by the head
     phase = _wrap(o.phase - other.phi - other.error)
     J = other.error_by + other.slope * r * moved
+    other = of.at(of.true(o.phase))  # what follows needs no order
     log = np.log(o.modulation / f.modulation) - other.gain + fine.gain
     level = (o.background - f.background) / np.sqrt(o.modulation * f.modulation)
     by = np.zeros_like(J)
@@ -205,7 +216,8 @@ def _triple_equations(t: Triple, ripple: _Ripple) -> list[tuple[F64, F64, F64]]:
     ]
 
 
-def _equations(pixels: Pixels, u: _Unknowns, theta: F64) -> list[_Equation]:
+def _equations(pixels: Pixels, u: _Unknowns, theta: F64, orders: bool = True) -> list[_Equation]:
+    """All equations; without `orders` those that rest on the order of a fine set are left out."""
     head = theta[: u.head]
     ripples = [_Ripple(u, head, o) for o in pixels.sets]
     out: list[_Equation] = []
@@ -220,7 +232,8 @@ def _equations(pixels: Pixels, u: _Unknowns, theta: F64) -> list[_Equation]:
 
     for n, pair in enumerate(pixels.pairs):
         for r, J, sigma, own in _pair_equations(n, pair, pixels, u, ripples):
-            add(r, J, sigma, pixels.block, own)
+            if own >= 0 or orders or abs(pair.ratio) > LIKE:
+                add(r, J, sigma, pixels.block, own)
     for o, ripple in zip(pixels.sets, ripples, strict=True):
         if len(o.bins):
             for r, J, sigma in _bin_equations(o, u, ripple):
@@ -239,12 +252,12 @@ def _weights(r: F64, sigma: F64) -> F64:
 
 
 def _normal(
-    pixels: Pixels, u: _Unknowns, theta: F64, keep: Bool, effect: float
+    pixels: Pixels, u: _Unknowns, theta: F64, keep: Bool, effect: float, orders: bool = True
 ) -> tuple[F64, F64, F64]:
     """Normal matrix and right side of the blocks in `keep`, and each block's score (blocks, P)."""
     blocks = len(keep)
     H, score = np.zeros((u.size, u.size)), np.zeros((blocks, u.size))
-    for e in _equations(pixels, u, theta):
+    for e in _equations(pixels, u, theta, orders):
         w = _weights(e.r, e.sigma) / effect * keep[e.block]
         H += (e.J * w) @ e.J.T
         pull = e.J * (w * e.r)
@@ -253,10 +266,10 @@ def _normal(
     return H, score.sum(0), score
 
 
-def _solve(pixels: Pixels, u: _Unknowns, keep: Bool, effect: float, theta: F64) -> F64:
+def _solve(pixels: Pixels, u: _Unknowns, keep: Bool, effect: float, theta: F64, orders: bool = True) -> F64:
     h = u.harmonics(theta[: u.head])
     for _ in range(ROUNDS):
-        H, g, _score = _normal(pixels, u, theta, keep, effect)
+        H, g, _score = _normal(pixels, u, theta, keep, effect, orders)
         step = np.linalg.solve(H + np.diag(u.prior), g - u.prior * (theta - u.start))
         largest = float(np.abs(step[: u.head]).max())
         theta = u.bounded(theta + step * min(1.0, 0.5 / max(largest, 1e-12)))
@@ -283,6 +296,8 @@ def fit(pixels: Pixels, levels: tuple[float, float], s: ResponseSettings) -> Fit
     blocks = int(max([pixels.block.max(), *(t.block.max() for t in pixels.triples)])) + 1
     every = np.ones(blocks, bool)
     theta, effect = u.start.copy(), EFFECT
+    if any(abs(p.ratio) <= LIKE for p in pixels.pairs):  # modulations tell what orders may be trusted
+        theta = _solve(pixels, u, every, effect, theta, orders=False)
     for _ in range(2):
         theta = _solve(pixels, u, every, effect, theta)
         H, _, score = _normal(pixels, u, theta, every, effect)

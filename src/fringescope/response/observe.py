@@ -136,10 +136,11 @@ def observe(
 def _usable(decoded: Decoded, s: ResponseSettings) -> Bool:
     out = np.ones(decoded.shape, bool)
     out &= (decoded.reasons & np.uint16(0xFFFF ^ UNUSABLE)) == 0
+    more_steps = any(w.steps > 3 for w in decoded.sets)  # a strong response passes for noise there
     for w in decoded.sets:
         lit = (w.saturated == 0) & (w.modulation > s.min_contrast * w.background)
-        usual = float(np.median(w.sigma[lit])) if lit.any() else 0.0  # a strong response passes for noise where N > 3
-        out &= lit & (w.sigma < max(s.max_sigma_rad, min(2 * usual, 1.0)))
+        usual = float(np.median(w.sigma[lit])) if lit.any() and more_steps else 0.0
+        out &= lit & (w.sigma < max(s.max_sigma_rad, min(2 * usual, 0.5)))
     for d in decoded.directions:
         out &= np.isfinite(d.phase)
     return out
