@@ -48,18 +48,21 @@ Key = tuple[int, str]
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Factors on the given sigmas and design effects, per camera and kind."""
+    """Factors on the given sigmas and design effects, per camera and kind; `own` factors of pictures that are worse than
+    the camera's others, per sighting and kind.
+    """
 
     factor: Mapping[Key, float]
     effect: Mapping[Key, float] = field(default_factory=dict)
+    own: Mapping[Key, float] = field(default_factory=dict)
 
     def variance(self, b: Block) -> F64:
         """Variance of each residual of a block as weighed: with the design effect."""
-        return np.asarray((self.factor[b.key] * b.sigma) ** 2 * self.effect.get(b.key, 1.0))
+        return np.asarray(self.spread(b) ** 2 * self.effect.get(b.key, 1.0))
 
     def spread(self, b: Block) -> F64:
         """Standard deviation of each residual of a block on its own."""
-        return np.asarray(self.factor[b.key] * b.sigma)
+        return np.asarray(self.factor[b.key] * self.own.get((b.sighting, b.kind), 1.0) * b.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,6 +215,7 @@ def polish(problem: Problem, state: State, noise: Noise, s: CalibrateSettings, t
     steps = 0
     weights: list[F64] = []
     for turn in range(turns):
+        noise = Noise(noise.factor, noise.effect, own_factors(problem, residuals(problem, state), noise))
         weights = hard_weights(problem, residuals(problem, state), noise, s.reject_sigma)
         state, n = minimise(problem, state, weights, s.rounds, TOLERANCE)
         steps += n
@@ -237,8 +241,19 @@ def components(problem: Problem, state: State, weights: Weights, noise: Noise) -
         k: max(noise.factor[k] * float(np.sqrt(squares[k] / max(count[k], 1.0))), 1e-9) if count[k] > 1 else noise.factor[k]
         for k in squares
     }
-    again = Noise(factor, noise.effect)
-    return Noise(factor, design_effects(problem, state, weights, again))
+    again = Noise(factor, noise.effect, noise.own)
+    return Noise(factor, design_effects(problem, state, weights, again), noise.own)
+
+
+def own_factors(problem: Problem, found: list[F64], noise: Noise) -> dict[Key, float]:
+    """How much worse than the camera's factor says each picture is, where it is (by medians, of 12 residuals at least)."""
+    out: dict[Key, float] = {}
+    for b, r in zip(problem.blocks, found, strict=True):
+        z = np.abs(r / (noise.factor[b.key] * b.sigma))
+        z = z[np.isfinite(z)]
+        if len(z) >= 12 and (worse := NORMAL_MAD * float(np.median(z))) > 1.25:
+            out[b.sighting, b.kind] = worse
+    return out
 
 
 CLUSTERS = (1.0, 2.0, 4.0)  #: sides of the patches, in squares, over which errors may be shared
