@@ -195,6 +195,7 @@ class Renderer:
         shape, light = np.empty(h * w, np.int16), np.empty(h * w, bool)
         shadow = np.empty((self.instrument.ring.lamps, h * w), bool)
         found: list[_Sparse] = []
+        glossy: list[_Sparse] = []
         for k in self._tiles(cam):
             index = np.arange(k.start, k.stop)
             origin, d = optics.look(cam.lens, cam.pose, _pixels(cam, index))
@@ -202,7 +203,7 @@ class Renderer:
             u[k], v[k], sigma[k], gain[k], steady[k] = rays.uv[:, 0], rays.uv[:, 1], rays.sigma, rays.gain, rays.room
             shape[k], light[k] = rays.surface.hits.shape, rays.lit
             spread[k] = self._spread(cam, rays.surface.hits, origin)
-            found.append(rays.mirrored)
+            glossy.append(rays.mirrored)
             seen = self._ring_shadows(rays.surface.hits, w)
             ring[k] = self._ring(cam, rays.surface, d, seen, index)
             shadow[:, k] = seen
@@ -210,9 +211,11 @@ class Renderer:
         foot, rough = _footprint(
             u.reshape(h, w), v.reshape(h, w), gain.reshape(h, w), shape.reshape(h, w), self._aspect
         )
+        one = _joined(glossy)
+        one = one._replace(sigma=np.hypot(one.sigma, _reach(one, (h, w), self._aspect) * spread[one.pixel]))
         if self._rays > 1:
             edges = np.flatnonzero(rough)
-            found = [f._replace(**_pick(f, ~rough[f.pixel])) for f in found]
+            one = one._replace(**_pick(one, ~rough[one.pixel]))
             gain[edges] = steady[edges] = ring[edges] = 0.0
             offsets, weight = _quadrature(self._rays), 1.0 / self._rays
             for part in np.array_split(edges, len(edges) // TILE + 1):
@@ -227,8 +230,9 @@ class Renderer:
                     direct = _Sparse(part[on], *(a.astype(np.float32) for a in numbers))
                     found += [direct, rays.mirrored._replace(gain=np.float32(weight) * rays.mirrored.gain)]
                     np.add.at(stray, rays.mirrored.pixel, np.float32(weight) * rays.mirrored.gain)
+        np.add.at(stray, one.pixel, one.gain)
         sigma = np.sqrt(sigma**2 + (foot.ravel() * spread) ** 2)
-        more = _Sparse(*(np.concatenate(c) for c in zip(*found, strict=True)))
+        more = _spread_out(_joined([one, *found]), self._aspect)
         smooth = gain > 0
         for a in (u, v):
             a[~smooth] = 0.0
@@ -318,7 +322,11 @@ class Renderer:
         return np.asarray(np.sqrt(o.blur_units**2 + defocus**2 + (spread_mm * f / depth) ** 2))
 
     def _mirror(self, cam: Camera, surface: _Surface, d: F64, pixel: AnyArray) -> _Sparse:
-        """Fringes that a wet surface mirrors into the camera from what lies around it (the paper's case 2)."""
+        """Fringes that a wet surface mirrors into the camera from what lies around it (the paper's case 2).
+
+        Facets of roughness alpha have slopes of variance alpha^2 / 2 each way (Walter et al. 2007), which turn what is
+        mirrored by twice as much in the plane of incidence, and by twice the cosine of incidence across it.
+        """
         hits, inst = surface.hits, self.instrument
         ne = -np.einsum("ij,ij->i", surface.shiny, d)
         out = d + 2 * ne[:, None] * surface.shiny
@@ -338,7 +346,8 @@ class Renderer:
         )  # fmt: skip
         value *= optics.fresnel(surface.f0[k], ne[k]) * light
         keep = np.flatnonzero(value > MIRROR_MIN)
-        sigma = self._blur(uvz[keep, 2], 0.5 * surface.alpha[k[keep]] * second.t[keep])
+        rough = surface.alpha[k[keep]] * np.sqrt(1 + ne[k[keep]] ** 2)
+        sigma = self._blur(uvz[keep, 2], rough * second.t[keep])
         return _Sparse(pixel[k[keep]], *(a.astype(np.float32) for a in (*uvz[keep, :2].T, sigma, value[keep])))
 
     def _lamps(self) -> F64:
@@ -381,6 +390,45 @@ _EMPTY = _Sparse(np.empty(0, np.intp), *(np.empty(0, np.float32) for _ in range(
 def _pixels(cam: Camera, index: AnyArray) -> F64:
     """Pixel numbers (n,) to coordinates (n, 2)."""
     return np.stack([index % cam.lens.width, index // cam.lens.width], 1).astype(np.float64)
+
+
+def _joined(parts: list[_Sparse]) -> _Sparse:
+    return _Sparse(*(np.concatenate(c) for c in zip(*parts, strict=True)))
+
+
+def _reach(s: _Sparse, shape: tuple[int, int], aspect: float) -> F32:
+    """Projector-plane units (along v, n) by which what is mirrored moves from a pixel to the next.
+
+    Differences to the four neighbours, of those that mirror something too; a curved film spreads what it mirrors.
+    """
+    place = np.full(shape[0] * shape[1], -1, np.int32)
+    place[s.pixel] = np.arange(s.pixel.size, dtype=np.int32)
+    place = place.reshape(shape)
+    total, count = np.zeros((2, s.pixel.size), np.float32), np.zeros((2, s.pixel.size), np.float32)
+    for axis in (0, 1):
+        low, high = ((slice(None),) * axis + (k,) for k in (slice(None, -1), slice(1, None)))
+        a, b = place[low].ravel(), place[high].ravel()
+        both = (a >= 0) & (b >= 0)
+        a, b = a[both], b[both]
+        length = ((s.u[a] - s.u[b]) / np.float32(aspect)) ** 2 + (s.v[a] - s.v[b]) ** 2
+        for k in (a, b):
+            total[axis][k] += length
+            count[axis][k] += 1
+    return np.asarray(np.sqrt(0.5 * (total / np.maximum(count, 1)).sum(0)), np.float32)
+
+
+def _spread_out(s: _Sparse, aspect: float) -> _Sparse:
+    """Light that is blurred by more than `MOST_BLUR`, from four places around instead, of the same total spread."""
+    wide = s.sigma > MOST_BLUR
+    if not wide.any():
+        return s
+    far = s._replace(**_pick(s, wide))
+    off = np.sqrt(far.sigma**2 - np.float32(MOST_BLUR) ** 2)
+    parts = [s._replace(**_pick(s, ~wide))]
+    for du, dv in _quadrature(4).astype(np.float32):
+        u, v = far.u + du * off * np.float32(aspect), far.v + dv * off
+        parts.append(far._replace(u=u, v=v, sigma=np.full_like(off, MOST_BLUR), gain=far.gain * np.float32(0.25)))
+    return _joined(parts)
 
 
 def _pick(s: _Sparse, keep: Bool) -> dict[str, AnyArray]:

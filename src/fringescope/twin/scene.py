@@ -133,7 +133,7 @@ def _tissue(name: str, seed: int, lift: float) -> Scene:
     base = SUBSTRATE_Z + lift
     mesh, arrays = specimens.build(name, seed, base)
     wet = Lazy(lambda: film(seed + 1, 0.05, 4.0, 90.0, 0.6))
-    tray = Finish(uniform((0.16, 0.18, 0.20)), alpha=0.12, f0=0.035, bumps=wet)
+    tray = Finish(uniform((0.16, 0.18, 0.20)), alpha=0.05, f0=0.035, bumps=wet)
     floor = tilted_plane(np.eye(3), (0.0, 0.0, base), tray)
     truth = {"tissue.json": {"mesh": "tissue_mesh.npz", "base_z": base}, "tissue_mesh.npz": arrays}
     return Scene(name, seed, (floor, mesh), lamp=specimens.SPECIMENS[name].lamp, ring=1.5, truth=truth)

@@ -13,6 +13,7 @@ from fringescope.types import F64, AnyArray
 
 GRID = 720  #: vertices along each side of a specimen's grid
 HALF_X, HALF_Y = 43.0, 29.0  #: mm; half size of the grid
+BELOW = -1.0  #: mm; how far below the substrate the grid goes on outside a specimen
 OUTLINE_X, OUTLINE_Y = 38.5, 24.5  #: mm; half axes of a specimen's outline before it is deformed
 
 
@@ -37,16 +38,34 @@ def _along(x: F64, rng: np.random.Generator, reach: float) -> F64:
     return np.asarray(reach * (0.7 * np.sin(x / 11 + p) + 0.45 * np.sin(x / 6 + q)))
 
 
+def _flank(t: AnyArray, softness: float = 0.08) -> F64:
+    """The square root of t, but of finite slope at 0 and going on below it: a body's flank down to its foot.
+
+    So the foot is a smooth line between the vertices of the grid, not a staircase along them.
+    """
+    return np.asarray(t / np.sqrt(np.sqrt(t * t + softness * softness)))
+
+
+def _settled(h: F64, rim: float = 0.35) -> F64:
+    """A soft wet body of height `h` on its substrate: its foot runs out into a rim of fluid `rim` mm high.
+
+    `h` must go on falling below 0 outside the body: where it has come down to -3 mm, on a steep flank about a
+    millimetre away, the rim has ended.
+    """
+    wetted = rim * np.clip(1 + np.minimum(h, 0) / 3.0, 0, None) ** 2
+    return np.asarray(wetted + 0.5 * (h + np.sqrt(h * h + 0.01)) - 0.002 + np.minimum(h + 3.0, 0))
+
+
 def domed(x: F64, y: F64, rng: np.random.Generator) -> F64:
     """Height above the substrate of a domed organ with two grooves."""
     r = _outline(x, y, rng)
-    h = 15.5 * np.sqrt(np.clip(1 - r**2.6, 0, None)) * (0.92 + 0.10 * noise(x, y, 24, rng))
+    h = 15.5 * _flank(1 - r**2.6) * (0.92 + 0.10 * noise(x, y, 24, rng))
     h += np.where(r < 1, 0.9 * fractal(x, y, 11, 3, rng) * _step((1 - r) * 4), 0)
     for k, depth in enumerate((3.2, 1.8)):
         d = y - (-1) ** k * (2.0 + 5.0 * k) - _along(x, rng, 2.2)
         h -= depth * np.exp(-((d / 1.3) ** 2)) * _step((0.8 - np.abs(x - 3 * k) / OUTLINE_X) * 4) * _step((1 - r) * 3)
     h += np.where(r < 1, 0.05 * fractal(x, y, 1.3, 3, rng) * _step((1 - r) * 6), 0)
-    return np.where(r < 1, h, -1.0)
+    return np.maximum(_settled(h), BELOW)
 
 
 def folded(x: F64, y: F64, rng: np.random.Generator) -> F64:
@@ -58,10 +77,10 @@ def folded(x: F64, y: F64, rng: np.random.Generator) -> F64:
     crest = np.sqrt(np.abs(np.sin(np.pi * s)) + 1e-4)  # cusps downwards: the clefts
     crest = np.clip((crest - 0.16) / 0.84, 0, 1)
     depth = 5.2 * (1 + 0.25 * noise(x, y, 13, rng))
-    body = 11.0 * np.clip(1 - r**4, 0, None) ** 0.5 + 1.0 * noise(x, y, 21, rng) * _step((1 - r) * 4)
+    body = 11.0 * _flank(1 - r**4) + 1.0 * noise(x, y, 21, rng) * _step((1 - r) * 4)
     h = body - depth * (1 - crest) * _step((1 - r) * 5)
     h += 0.06 * fractal(x, y, 1.4, 3, rng) * _step((1 - r) * 6)
-    return np.where(r < 1, np.maximum(h, 0.25), -1.0)
+    return np.maximum(_settled(np.where(r < 0.97, np.maximum(h, 0.25), h)), BELOW)
 
 
 def thin(x: F64, y: F64, rng: np.random.Generator) -> F64:
@@ -69,14 +88,16 @@ def thin(x: F64, y: F64, rng: np.random.Generator) -> F64:
     r = _outline(x, y, rng, 0.06)
     h = 1.3 + 0.5 * noise(x, y, 12, rng) + 1.2 * np.clip(fractal(x, y, 19, 2, rng), 0, None)
     line = -3.0 + _along(x, rng, 1.8)
+    cut = _step((y - line) / 1.2)
     lift = _step((0.62 - np.abs(x + 2.0) / OUTLINE_X) * 2.2)
     up = np.clip(1 - (y - line) / 15.0, 0, 1) ** 1.6
-    h += np.where(y > line, 8.5 * lift * up, 0)
+    h += 8.5 * cut * lift * up
     curl = np.exp(-(((y + 17 + 1.5 * noise(x, y, 14, rng)) / 2.6) ** 2))
     h += 2.4 * curl * (0.6 + 0.6 * noise(x, y, 16, rng)) * _step((1 - r) * 3)
     h += 0.05 * fractal(x, y, 1.2, 3, rng)
     rim = _step((1 - r) * 9) * 0.85 + 0.15
-    return np.where(r < 1, np.maximum(h * rim, 0.22), -1.0)
+    edge = 12.0 * (1 - r)
+    return np.maximum(np.minimum(np.maximum(h * rim, 0.22), edge), BELOW)
 
 
 @dataclass(frozen=True)
