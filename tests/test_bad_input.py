@@ -26,12 +26,15 @@ PLANE = (100, 80)
 
 
 def view_input(
-    fmt: PixelFormat = PixelFormat.MONO8, periods: tuple[float, ...] = (110.0, 16.0), dark: bool = False
+    fmt: PixelFormat = PixelFormat.MONO8,
+    periods: tuple[float, ...] = (110.0, 16.0),
+    dark: bool = False,
+    rows: int = H,
 ) -> ViewInput:
     """Fringes that a camera sees when it looks straight at the projector's plane."""
     sets = tuple(FringeSet((1 / p, 0.0), 4) for p in periods)
     plan = ViewPlan("camera1", fmt, sets, PLANE)
-    x = np.tile(10 + np.arange(W) * 1.2, (H, 1))
+    x = np.tile(10 + np.arange(W) * 1.2, (rows, 1))
     frames = []
     for k in plan.keys:
         p = periods[k.set_index]
@@ -204,6 +207,11 @@ def test_an_empty_view(tmp_path: Path, rig: Path, refused: Callable[..., str]) -
     refused("reconstruct", tmp_path / "c", "--rig", rig, "--out", tmp_path / "out")
 
 
+def test_frames_of_one_row(tmp_path: Path, refused: Callable[..., str]) -> None:
+    store.write_capture(tmp_path / "c", *PLANE, Layout.GRID, [view_input(rows=1)])
+    assert f"frames of {W} x 1 pixels" in refused("decode", tmp_path / "c", "--out", tmp_path / "out")
+
+
 def test_sets_that_cannot_be_unwrapped(tmp_path: Path, refused: Callable[..., str]) -> None:
     store.write_capture(tmp_path / "c", *PLANE, Layout.GRID, [view_input(periods=(16.0,))])
     line = refused("decode", tmp_path / "c", "--out", tmp_path / "out")
@@ -235,7 +243,9 @@ def first_set(doc: dict[str, Any]) -> Any:
         (lambda d: first_set(d)["frames"].__setitem__(0, "camera1\\00.png"), "forward slashes"),
         (lambda d: first_set(d)["frames"].__setitem__(0, "a\u0000b.png"), "control"),
         (lambda d: first_set(d)["frames"].__setitem__(0, "x" * 600 + ".png"), "too long"),
-        (lambda d: first_set(d).update(cycles_per_pixel=[0, 0]), "more than one projector-plane unit"),
+        (lambda d: first_set(d).update(cycles_per_pixel=[0, 0]), "more than 1e-09 cycles"),
+        (lambda d: first_set(d).update(cycles_per_pixel=[0, 1e-300]), "more than 1e-09 cycles"),
+        (lambda d: first_set(d).update(cycles_per_pixel=[0, 2]), "more than one projector-plane unit"),
         (lambda d: first_set(d).update(cycles_per_pixel=[0.1]), "two numbers"),
         (lambda d: first_set(d).update(gray="u"), "either"),
         (lambda d: d["views"][0].update(pixel_format="Mono9"), "needed one of"),
@@ -246,8 +256,11 @@ def first_set(doc: dict[str, Any]) -> Any:
         (lambda d: d.update(version=2), "higher"),
         (lambda d: d.update(format="x"), "format"),
         (lambda d: d["projector"].update(layout="hexagon"), "diamond"),
-        (lambda d: d["projector"].pop("width"), "projector.width: Field required"),
-        (lambda d: d["projector"].update(width="912"), "integer"),
+        (lambda d: d["projector"].pop("width"), "projector.width is missing"),
+        (lambda d: d["projector"].update(width="912"), 'projector.width: needed a whole number; came "912"'),
+        (lambda d: d["projector"].update(width=0), "needed at least 1; came 0"),
+        (lambda d: d.update(views={}), "needed a list"),
+        (lambda d: d.update(projector=[]), "needed an object {...}"),
         (lambda d: d["views"][0].update(noise={"a": -1, "b": 0}), "noise"),
     ],
 )
@@ -417,6 +430,8 @@ def test_a_failed_import_leaves_nothing(tmp_path: Path, refused: Callable[..., s
     refused(*args, "--steps", "4", "--periods", "nan", status=2)
     refused(*args, "--steps", "4", "--periods", "36", "--direction", "w", status=2)
     refused(*args, "--steps", "4", "--periods", "36", "--projector", "912", status=2)
-    refused(*args, "--steps", "4", "--periods", "36", "--camera", "../x")
+    refused(*args, "--steps", "4", "--periods", "36", "--camera", "../x", status=2)
+    nowhere = ["import", tmp_path / "nowhere", *args[2:], "--steps", "4", "--periods", "36"]
+    assert "--camera ../x" in refused(*nowhere, "--camera", "../x", status=2)  # said before anything is read
     shutil.copy(tmp_path / "in/0.png", tmp_path / "in/4.png")
     assert "5 images" in refused(*args, "--steps", "4", "--periods", "36")

@@ -59,6 +59,25 @@ def test_simulate_leaves_a_capture_with_its_truth(simulated: Path) -> None:
     assert (simulated / "truth" / "plane.json").is_file()
 
 
+def test_some_views_of_a_capture(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A capture may hold more cameras than the rig, or than one wants."""
+    rig = json.loads((simulated / "truth" / "rig.json").read_text())
+    rig["cameras"] = [c for c in rig["cameras"] if c["name"] == "camera2"]
+    (tmp_path / "rig.json").write_text(json.dumps(rig))
+    args = ["reconstruct", str(simulated), "--rig", str(tmp_path / "rig.json"), "--no-preview"]
+    assert run([*args, "--out", str(tmp_path / "a")]) == 1
+    assert "lacks camera 'camera1', it has camera2: use" in capsys.readouterr().err
+    assert run([*args, "--view", "camera3", "--out", str(tmp_path / "a")]) == 2
+    assert "it has camera1, camera2" in capsys.readouterr().err
+    doc = answer([*args, "--view", "camera2", "--out", str(tmp_path / "a")], capsys)
+    assert [v["camera"] for v in doc["views"]] == ["camera2"]
+    doc = answer(["decode", str(simulated), "--view", "camera1", "--out", str(tmp_path / "d")], capsys)
+    assert [v["camera"] for v in doc["views"]] == ["camera1"]
+    both = ["--view", "camera1", "--view", "camera2"]
+    doc = answer(["decode", str(simulated), *both, "--out", str(tmp_path / "e")], capsys)
+    assert len(doc["views"]) == 2
+
+
 def test_reconstruct_leaves_a_scan_on_the_true_plane(simulated: Path, scan: Path) -> None:
     """Truth from the twin: the points of the grids lie on its plane."""
     truth = json.loads((simulated / "truth" / "plane.json").read_text())

@@ -5,6 +5,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -457,6 +461,101 @@ def test_force_replaces_only_its_own_kind_and_only_at_the_end(tmp_path: Path) ->
         (tmp / "scan.json").write_text("second")
         assert (target / "scan.json").read_text() == "first"
     assert (target / "scan.json").read_text() == "second"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+KILLED = """
+import os, signal, sys
+from fringescope import store
+def folder(path):
+    with store.new_folder(path, marker="scan.json", force=True) as tmp:
+        (tmp / "a").write_text("half")
+        wait()
+def file(path):
+    with store.new_file(path, force=True) as tmp:
+        tmp.write_text("half")
+        wait()
+def wait():
+    print("ready", flush=True)
+    sys.stdin.read()
+{"folder": folder, "file": file}[sys.argv[1]](sys.argv[2])
+"""
+
+
+def begin(kind: str, target: Path) -> subprocess.Popen[str]:
+    """A process that is in the midst of writing."""
+    command = [sys.executable, "-c", KILLED, kind, str(target)]
+    run = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert run.stdout is not None
+    assert run.stdout.readline().strip() == "ready"
+    return run
+
+
+def kill(run: subprocess.Popen[str]) -> None:
+    run.kill()
+    run.communicate()
+
+
+def age(folder: Path, to: float = 0.0) -> None:
+    for p in folder.iterdir():
+        if p.name.startswith("."):
+            os.utime(p, (to, to))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no locks that end with their process here")
+def test_what_a_killed_run_left_goes_with_the_next(tmp_path: Path) -> None:
+    target, kept = tmp_path / "out", tmp_path / "out.other"
+    dead, live, other = begin("folder", target), begin("folder", target), begin("folder", kept)
+    try:
+        kill(dead)
+        kill(other)
+        assert len([p for p in tmp_path.iterdir() if p.suffix == ".part"]) == 3
+        age(tmp_path, time.time())
+        with store.new_folder(target, marker="scan.json") as tmp:
+            (tmp / "scan.json").write_text("{}")
+        left = [p for p in tmp_path.iterdir() if p.suffix == ".part"]
+        assert len(left) == 3  # too young to be sure
+        age(tmp_path)
+        with store.new_folder(target, marker="scan.json", force=True) as tmp:
+            (tmp / "scan.json").write_text("{}")
+        left = [p for p in tmp_path.iterdir() if p.suffix == ".part"]
+        assert len(left) == 2  # the one that still runs, and that of another target
+        assert [p for p in left if p.name.startswith(".out.other.")]
+    finally:
+        kill(live)
+    age(tmp_path)
+    with store.new_folder(target, marker="scan.json", force=True) as tmp:
+        (tmp / "scan.json").write_text("{}")
+    assert len([p for p in tmp_path.iterdir() if p.suffix == ".part"]) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no locks that end with their process here")
+def test_what_a_killed_run_left_of_a_file_goes_with_the_next(tmp_path: Path) -> None:
+    target = tmp_path / "rig.json"
+    kill(begin("file", target))
+    live = begin("file", target)
+    try:
+        age(tmp_path)
+        with store.new_file(target) as tmp:
+            tmp.write_text("{}")
+        assert len(list(tmp_path.iterdir())) == 2
+    finally:
+        kill(live)
+    age(tmp_path)
+    with store.new_file(target, force=True) as tmp:
+        tmp.write_text("{}")
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.json"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no locks that end with their process here")
+def test_a_folder_that_a_killed_run_had_set_aside_comes_back(tmp_path: Path) -> None:
+    target, aside = tmp_path / "out", tmp_path / ".out.abcd1234.old"
+    (aside / "was").mkdir(parents=True)
+    (aside / "was" / "scan.json").write_text("first")
+    age(tmp_path)
+    with pytest.raises(OutputError, match="already holds a scan"), store.new_folder(target, marker="scan.json"):
+        pass
+    assert (target / "scan.json").read_text() == "first"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 

@@ -231,12 +231,15 @@ def import_(
     written and the options that would mend it are named.
     """
     from fringescope import importing, store
+    from fringescope.store.files import check_name
     from fringescope.types import Layout
 
     if layout not in ("grid", "diamond"):
         raise UsageError(f"--layout {layout}; needed grid or diamond")
     if order not in ("sets", "interleaved"):
         raise UsageError(f"--order {order}; needed sets or interleaved")
+    if bad := check_name(camera):
+        raise UsageError(f"--camera {camera}: {bad}")
     code = None
     if gray is not None:
         code = importing.Gray(gray, gray_cell, gray_bits, gray_inverse, gray_white_black)

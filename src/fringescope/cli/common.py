@@ -36,6 +36,9 @@ SettingsFile = Annotated[
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.NAME=VALUE", help="One threshold; may be repeated.")
 ]
+Views = Annotated[
+    list[str] | None, typer.Option("--view", metavar="CAMERA", help="Only this camera's view; may be repeated.")
+]
 
 
 def load_settings(file: Path | None, changes: Iterable[str] | None) -> tree.Settings:

@@ -18,6 +18,7 @@ from fringescope.cli.common import (
     Progress,
     SetOption,
     SettingsFile,
+    Views,
     emit,
     existing,
     load_settings,
@@ -29,7 +30,7 @@ from fringescope.errors import EmptyResultError, UsageError
 if TYPE_CHECKING:
     from fringescope.evaluate import Evaluation
     from fringescope.settings import Settings
-    from fringescope.store import StoredScan
+    from fringescope.store import Capture, StoredScan
     from fringescope.types import U8, Cloud, Decoded, Scan, ViewInput
 
 
@@ -46,12 +47,15 @@ def scan_into(
     grids: bool = False,
     all_points: bool = False,
     preview: bool = True,
+    only: Sequence[str] | None = None,
 ) -> tuple[Scan, dict[str, Any]]:
-    """Reconstructs a capture and writes the scan into a folder that is being made; returns it with its scan.json."""
+    """Reconstructs a capture (of some cameras `only`) and writes the scan into a folder that is being made; returns it
+    with its scan.json.
+    """
     from fringescope import export, pipeline, store
     from fringescope.settings import to_dict
 
-    c = store.read_capture(capture)
+    c = picked(store.read_capture(capture), only)
     r = store.read_rig(rig)
     store.check_rig(c, r)
     scan = pipeline.scan(store.view_inputs(c), r, s, all_points=all_points, progress=progress.share)
@@ -74,6 +78,17 @@ def scan_into(
         ),
     )
     return scan, doc
+
+
+def picked(capture: Capture, cameras: Sequence[str] | None) -> Capture:
+    """The views that `--view` names, or all. Raises UsageError."""
+    if not cameras:
+        return capture
+    there = [v.camera for v in capture.views]
+    for c in cameras:
+        if c not in there:
+            raise UsageError(f"--view {c}: {capture.document} has no such view; it has {', '.join(there)}")
+    return capture.only(cameras)
 
 
 def folder_title(path: Path) -> str:
@@ -104,6 +119,7 @@ def reconstruct(
         bool, typer.Option("--grids", help="Also write the organised points as TIFF, the reasons as PNG.")
     ] = False,
     preview: Annotated[bool, typer.Option(help="Also write view.html, which shows the surface in a browser.")] = True,
+    only: Views = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -114,7 +130,9 @@ def reconstruct(
 
     s = load_settings(settings, set_)
     with store.new_folder(out, marker="scan.json", force=force) as tmp, Progress() as progress:
-        _, doc = scan_into(tmp, capture, rig, s, progress, grids=grids, all_points=all_points, preview=preview)
+        _, doc = scan_into(
+            tmp, capture, rig, s, progress, grids=grids, all_points=all_points, preview=preview, only=only
+        )
     emit({"scan": str(out), **doc}, json, scan_summary(doc, out))
 
 
@@ -144,6 +162,7 @@ def decode(
     axis: Annotated[str | None, typer.Option(help="Of a stack: the axis along which the steps lie, as Z.")] = None,
     time: Annotated[int | None, typer.Option(help="Of a stack: which time.")] = None,
     pixel_format_: Annotated[str | None, typer.Option("--pixel-format", help="Of a stack: as Mono12.")] = None,
+    only: Views = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -162,6 +181,8 @@ def decode(
         views: Sequence[ViewInput]
         extra: dict[str, Any] = {}
         if capture.is_file() and capture.suffix.lower() in (".tif", ".tiff"):
+            if only:
+                raise UsageError(f"--view {only[0]}: a stack has one view; leave the option out")
             n = None if steps is None else numbers(steps, "--steps", int)[0]
             view, note, digest = importing.stack_view(capture, n, axis, time, pixel_format(pixel_format_))
             views, extra = (view,), {"source": capture.name, "note": note}
@@ -169,7 +190,7 @@ def decode(
         elif (steps, axis, time, pixel_format_) != (None,) * 4:
             raise UsageError("--steps, --axis, --time, --pixel-format are for a TIFF stack; a capture says them itself")
         else:
-            c = store.read_capture(capture)
+            c = picked(store.read_capture(capture), only)
             views, digest = store.view_inputs(c), ""
         decoded = []
         for v in progress.track(views, "decoding", len(views)):

@@ -104,15 +104,17 @@ def _view(
     folder: Path, camera: str, recipe: Recipe, pattern: str, fmt: PixelFormat | None, shift: int, color: str | None
 ) -> ImportedView:
     names = [p.name for p in image_files(folder, pattern) if p.name != color]
+    lossy = sum(n.lower().endswith(LOSSY) for n in names)
     if len(names) != recipe.files_needed:
+        of_them = f" ({lossy} of them JPEG or WebP, which lose what phase needs)" if lossy else ""
         raise CaptureError(
-            f"{folder}: {len(names)} images, --steps and --periods need {recipe.files_needed}: mend them, pick files "
-            "with --glob, name the ring-light picture with --color and Gray code with --gray"
+            f"{folder}: {len(names)} images{of_them}, --steps and --periods need {recipe.files_needed}: mend them, "
+            "pick files with --glob, name the ring-light picture with --color and Gray code with --gray"
         )
     images = LooseFrames(folder, names, left_aligned=shift, fmt=fmt)
     notes = [f"{len(names)} images, {names[0]} to {names[-1]}", *_depth_note(images)]
-    if any(n.lower().endswith(LOSSY) for n in names):
-        notes.append("JPEG loses what phase needs: record PNG or TIFF")
+    if lossy:
+        notes.append(f"{lossy} images are JPEG or WebP, which lose what phase needs: record PNG or TIFF")
     picture = None if color is None else LooseFrames(folder, [color], left_aligned=shift, fmt=images.fmt)
     return ImportedView(camera, images, tuple(notes), picture)
 

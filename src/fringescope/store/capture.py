@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from fringescope.errors import CaptureError, FormatError
+from fringescope.errors import CaptureError, FormatError, RigError
 from fringescope.store import files
 from fringescope.store.images import Images, check_frame, check_header, split_page, write_png
 from fringescope.store.rig import explain, parse_layout
@@ -33,6 +33,8 @@ from fringescope.types import (
 )
 
 FORMAT, VERSION = "fringescope-capture", 1
+LEAST_CYCLES = 1e-9  #: per projector-plane unit; less is no fringe
+LEAST_SIDE = 2  #: rows and columns of a frame: a pixel is judged by its neighbours
 
 
 class _Model(BaseModel):
@@ -113,6 +115,11 @@ class Capture:
             if v.camera == camera:
                 return v
         raise CaptureError(f"{self.document}: no view of '{camera}'; it has {', '.join(v.camera for v in self.views)}")
+
+    def only(self, cameras: Sequence[str]) -> Capture:
+        """The capture with the views of some cameras alone, in its own order. Raises as `view`."""
+        names = {self.view(c).camera for c in cameras}
+        return replace(self, views=tuple(v for v in self.views if v.camera in names))
 
 
 class Frames:
@@ -204,6 +211,9 @@ def _view(m: _View, i: int, noise: _Noise | None, size: tuple[int, int], documen
     n_ = m.noise or noise
     model = None if n_ is None else NoiseModel(n_.a, n_.b, files.CAPTURE)
     assert view_size is not None  # a plan has at least one frame
+    if min(view_size) < LEAST_SIDE:
+        came = f"frames of {view_size[0]} x {view_size[1]} pixels"
+        raise CaptureError(f"{where}: {came}; needed at least {LEAST_SIDE} rows and columns of an area camera")
     return CaptureView(plan, tuple(names), view_size, m.color, model)
 
 
@@ -230,8 +240,10 @@ def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
     g = s.cycles_per_pixel
     if g is None or len(g) != 2:
         raise CaptureError(f"cycles_per_pixel {files.shown(g)}; needed two numbers")
-    if not 1e-9 < math.hypot(*g) < 1:
+    if not math.hypot(*g) < 1:
         raise CaptureError(f"cycles_per_pixel {files.shown(g)}; needed a period of more than one projector-plane unit")
+    if not math.hypot(*g) > LEAST_CYCLES:
+        raise CaptureError(f"cycles_per_pixel {files.shown(g)}; needed fringes: more than {LEAST_CYCLES:g} cycles")
     return FringeSet((g[0], g[1]), steps, s.exposure_us), list(s.frames)
 
 
@@ -319,7 +331,13 @@ def check_rig(capture: Capture, rig: Rig) -> None:
             f"{capture.document}: projector {came[0]} x {came[1]} {came[2].value}; the rig has {p.width} x {p.height} "
             f'{p.layout.value}: use the rig of this instrument, or mend "projector"'
         )
+    there = [c.name for c in rig.cameras]
     for v in capture.views:
+        if v.camera not in there:
+            raise RigError(
+                f"{capture.document}: the rig lacks camera '{v.camera}', it has {', '.join(there)}: use the rig of "
+                "this instrument, or pick views with --view"
+            )
         lens = rig.camera(v.camera).lens
         if v.size != (lens.width, lens.height):
             raise CaptureError(

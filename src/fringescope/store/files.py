@@ -2,6 +2,9 @@
 
 A folder that we write holds a *marker*, the JSON file that says what it is (`capture.json`, `scan.json`, ...). `force`
 replaces a folder only if it holds the marker of what is being written: a scan never replaces a capture.
+
+A run that is killed leaves its hidden work behind. Whoever writes holds a lock on its work, which ends with the process
+however that ends: the next run for the same target takes away what nobody holds any more.
 """
 
 from __future__ import annotations
@@ -10,12 +13,19 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # no such locks here: nothing is swept
+    fcntl = None  # type: ignore[assignment]
 
 from fringescope.errors import FormatError, OutputError
 
@@ -81,6 +91,59 @@ def _check_target_folder(path: Path, marker: str, force: bool) -> None:
         raise OutputError(f"{path}: already holds a {Path(marker).stem}; choose another folder, or add --force")
 
 
+def _hold(work: Path) -> int | None:
+    """Locks a file or folder for as long as this process lives or until `_let_go`; None where another holds it."""
+    if fcntl is None:
+        return None
+    try:
+        fd = os.open(work, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(fd)
+        return None
+    return fd
+
+
+def _let_go(fd: int | None) -> None:
+    if fd is not None:
+        os.close(fd)
+
+
+FRESH_S = 5.0  #: work this young may not have its lock yet
+
+
+def _sweep(target: Path, stem: str, suffix: str) -> None:
+    """Takes away what killed runs left of `target`: work that is not fresh, ours, and held by nobody.
+
+    Killed between the two renames of `_swap`, the former folder still lies aside: it is put back.
+    """
+    if fcntl is None:
+        return
+    ours = re.compile(rf"\.{re.escape(stem[:80])}\.[A-Za-z0-9_]{{8}}(\.part{re.escape(suffix)}|\.old)")
+    for left in sorted(target.parent.glob(".*")):
+        if not ours.fullmatch(left.name) or left.is_symlink():
+            continue
+        with suppress(OSError):
+            told = left.stat()
+            if told.st_uid != os.getuid() or time.time() - told.st_mtime < FRESH_S:
+                continue
+            fd = _hold(left)
+            if fd is None:
+                continue
+            try:
+                if left.is_file():
+                    left.unlink()
+                    continue
+                if left.suffix == ".old" and (left / "was").is_dir() and not os.path.lexists(target):
+                    (left / "was").replace(target)
+                shutil.rmtree(left, ignore_errors=True)
+            finally:
+                _let_go(fd)
+
+
 @contextmanager
 def new_folder(path: Path | str, *, marker: str, force: bool = False) -> Iterator[Path]:
     """A folder that appears whole at the end of the block, or not at all.
@@ -92,15 +155,19 @@ def new_folder(path: Path | str, *, marker: str, force: bool = False) -> Iterato
     """
     path = Path(path)
     try:
-        _check_target_folder(path, marker, force)
         target = path.resolve()  # a link to a folder stays a link
+        if target.parent.is_dir():
+            _sweep(target, target.name, "")
+        _check_target_folder(path, marker, force)
         made = _make_parents(target.parent)
     except OSError as e:
         raise OutputError(f"{path}: cannot write: {_why(e)}") from e
     work: Path | None = None
+    held: int | None = None
     try:
         try:
             work = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".part", dir=target.parent))
+            held = _hold(work)
             yield work
             for f in sorted(work.rglob("*")):
                 if f.is_file():
@@ -118,23 +185,30 @@ def new_folder(path: Path | str, *, marker: str, force: bool = False) -> Iterato
             with suppress(OSError):
                 p.rmdir()
         raise
+    finally:
+        _let_go(held)
 
 
 def _swap(work: Path, target: Path) -> None:
     old: Path | None = None
-    if target.exists():
-        old = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".old", dir=target.parent))
-        target.replace(old / "was")
+    held: int | None = None
     try:
-        work.replace(target)
-    except BaseException:
+        if target.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".old", dir=target.parent))
+            held = _hold(old)
+            target.replace(old / "was")
+        try:
+            work.replace(target)
+        except BaseException:
+            if old is not None:
+                (old / "was").replace(target)
+                old.rmdir()
+            raise
+        _sync_folder(target.parent)
         if old is not None:
-            (old / "was").replace(target)
-            old.rmdir()
-        raise
-    _sync_folder(target.parent)
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+    finally:
+        _let_go(held)
 
 
 @contextmanager
@@ -151,16 +225,20 @@ def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
         raise OutputError(f"{path}: exists; choose another name, or add --force to replace it")
     try:
         target = path.resolve()
+        if target.parent.is_dir():
+            _sweep(target, target.stem, target.suffix)
         made = _make_parents(target.parent)
     except OSError as e:
         raise OutputError(f"{path}: cannot write: {_why(e)}") from e
     work: Path | None = None
+    held: int | None = None
     try:
         try:
             prefix, suffix = f".{target.stem[:80]}.", f".part{target.suffix}"
             fd, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=target.parent)
             os.close(fd)
             work = Path(name)
+            held = _hold(work)
             yield work
             work.chmod(_umask_mode(0o666))
             _sync(work)
@@ -175,6 +253,8 @@ def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
             with suppress(OSError):
                 p.rmdir()
         raise
+    finally:
+        _let_go(held)
 
 
 # --------------------------------------------------------------------------------------------------------------- JSON

@@ -54,14 +54,42 @@ class _Rig(_Model):
     volume: _Volume | None = None
 
 
+#: kind of a schema's error -> what was needed, in JSON's words
+_NEEDED = {
+    "int": "a whole number",
+    "float": "a number",
+    "finite_number": "a finite number",
+    "string": "text in quotes",
+    "bool": "true or false",
+    "list": "a list [...]",
+    "tuple": "a list [...]",
+    "dict": "an object {{...}}",
+    "model": "an object {{...}}",
+    "greater_than_equal": "at least {ge:g}",
+    "greater_than": "more than {gt:g}",
+    "less_than_equal": "at most {le:g}",
+    "less_than": "less than {lt:g}",
+    "too_long": "at most {max_length} entries",
+    "too_short": "at least {min_length} entries",
+    "string_too_long": "at most {max_length} letters",
+    "string_too_short": "at least {min_length} letters",
+    "literal_error": "{expected}",
+}
+
+
 def explain(e: ValidationError, path: Path) -> str:
-    """One line of what pydantic found."""
-    errors = e.errors(include_url=False, include_context=False)
+    """One line of the first thing that does not fit a file's schema: where, what was needed, what came."""
+    errors = e.errors(include_url=False)
     first = errors[0]
     where = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
-    got = "" if first["type"] == "missing" else f"; came {files.shown(first['input'])}"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return f"{path}: {files.shown(where)[1:-1]}: {first['msg']}{got}{more}"
+    place = files.shown(where)[1:-1] or "the whole"
+    kind = first["type"]
+    if kind == "missing":
+        return f"{path}: {place} is missing{more}"
+    words = _NEEDED.get(kind) or _NEEDED.get(kind.removesuffix("_type").removesuffix("_parsing"))
+    needed = words.format(**first.get("ctx", {})) if words else "something else"
+    return f"{path}: {place}: needed {needed}; came {files.shown(first['input'])}{more}"
 
 
 def parse_layout(name: str, path: Path) -> Layout:
