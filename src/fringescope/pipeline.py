@@ -7,15 +7,33 @@ parts it is made of.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from fringescope import denoise, fuse, geometry, phase, triangulate
-from fringescope.errors import EmptyResultError
+from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, triangulate
+from fringescope.errors import CalibrationError, CaptureError, EmptyResultError
 from fringescope.settings import Settings
-from fringescope.types import Decoded, Grid, Photo, Rig, Scan, Surface, ViewInput
+from fringescope.types import (
+    F32,
+    AnyArray,
+    Board,
+    Calibration,
+    Decoded,
+    Evidence,
+    FrameKey,
+    Grid,
+    NoiseModel,
+    Photo,
+    Rig,
+    Scan,
+    Sighting,
+    Surface,
+    ViewInput,
+    ViewPlan,
+)
 
 Progress = Callable[[str, float], None]  #: called with what is being done and the share that is done, 0 to 1
 
@@ -46,6 +64,134 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
     reasons = denoise.local(decoded, reasons, rig, s.denoise)
     grid = triangulate.grid(decoded, reasons, rig, volume_margin=s.denoise.volume_margin)  # equations 8 to 15
     return phase.with_reasons(decoded, grid.reasons), grid
+
+
+BAND = 4_000_000  #: pixels of a board picture that are decoded at a time
+SIMPLE = 2_000_000  #: pixels that suffice to estimate the noise
+
+
+def see_board(view: ViewInput, board: Board, pose: str, s: Settings) -> tuple[Sighting | None, F32, str]:
+    """One camera's frames of the board: its sighting, the mean picture (H, W) in codes, and what is wrong if None.
+
+    Raw frames are kept and decoded band by band, so that 24 frames of 20 megapixels take less than 3 GB. Raises
+    CaptureError or DecodeError for frames that do not fit.
+    """
+    frames = [(key, frame) for key, frame in view.frames]
+    decoded, mean = decode_bands(replace(view, frames=frames), s)
+    try:
+        return calibrate.see(decoded, mean, view.plan, board, pose, s.board), mean, ""
+    except CalibrationError as e:
+        return None, mean, str(e)
+
+
+def decode_bands(view: ViewInput, s: Settings) -> tuple[Decoded, F32]:
+    """As `decode_view` with the masks of exposure alone, in bands of rows, and the mean of the fringe frames (H, W).
+
+    What neighbours say of an order overlaps between the bands. The wrapped sets are not kept (`sets` is empty).
+    """
+    frames = list(view.frames)
+    if not frames:
+        raise CaptureError(f"view '{view.plan.camera}': no frames came")
+    H, W = frames[0][1].shape[:2]
+    rows = max(64, BAND // W // 2 * 2)
+    noise = view.noise or _noise_of_rows(view.plan, frames, s)
+    overlap = 2 * 4 * (s.phase.order_votes // 2)
+    parts: list[Decoded] = []
+    for row in range(0, H, rows):
+        top, end = max(row - overlap, 0), min(row + rows, H)
+        below = min(end + overlap, H)
+        band = [(key, np.ascontiguousarray(f[top:below])) for key, f in frames]
+        measured = phase.measure(band, view.plan, s.phase, noise)
+        decoded = phase.settle_order(measured, view.plan, s.phase)
+        reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)
+        parts.append(phase.crop_rows(phase.with_reasons(decoded, reasons), row - top, end - top))
+    return phase.join_rows(parts), phase.mean_picture(frames, view.plan)
+
+
+def _noise_of_rows(plan: ViewPlan, frames: Sequence[tuple[FrameKey, AnyArray]], s: Settings) -> NoiseModel:
+    """The noise from pairs of rows all over the picture, so that no band has its own."""
+    H, W = frames[0][1].shape[:2]
+    pairs = np.arange(0, max(H - 1, 1), 2)
+    pairs = pairs[:: max(1, H * W // SIMPLE)]
+    rows = np.stack([pairs, np.minimum(pairs + 1, H - 1)], 1).ravel()
+    return phase.measure([(k, f[rows]) for k, f in frames], plan, s.phase).noise
+
+
+def calibrate_rig(
+    sightings: Sequence[Sighting],
+    board: Board,
+    sizes: calibrate.Sizes,
+    s: Settings,
+    progress: Progress | None = None,
+    wrong: Sequence[str] = (),
+) -> tuple[Calibration, Evidence]:
+    """Sightings of all poses to a rig and the evidence for it. `wrong` says, for messages, what was not seen and why.
+
+    Raises CalibrationError, with what to photograph, where they do not make a rig.
+    """
+    tell = progress or _silent
+    poses: dict[str, list[Sighting]] = {}
+    for one in sightings:
+        poses.setdefault(one.pose, []).append(one)
+    if not poses:
+        raise CalibrationError(f"no board was found in any picture; {wrong[0] if wrong else 'the session is empty'}")
+    tell("numbering the corners", 0.0)
+    agreed = [x for group in poses.values() for x in calibrate.agree(group, board)]
+    tell("adjusting all devices and boards at once", 0.1)
+    solved = calibrate.solve(agreed, board, sizes, s.calibrate)
+    tell("leaving each pose out in turn", 0.4)
+    held_out = calibrate.leave_one_out(solved, s.calibrate)
+    tell("gathering the evidence", 0.8)
+    evidence = calibrate.evidence(solved, held_out, s.evidence)
+    tell("done", 1.0)
+    return solved, evidence
+
+
+def verify(
+    views: Sequence[ViewInput],
+    rig: Rig,
+    s: Settings,
+    board: Board | None = None,
+    sphere_mm: float | None = None,
+    *,
+    must_see_board: bool = False,
+    progress: Progress | None = None,
+) -> evaluate.Verdict:
+    """Is the rig still true? From one capture: of a board, of a sphere of radius `sphere_mm`, or of anything.
+
+    `must_see_board`: no board found is an error, not a doubt. Raises as `scan_view`, and CalibrationError.
+    """
+    tell = progress or _silent
+    grids: list[Grid] = []
+    sightings: list[Sighting] = []
+    doubts: list[str] = []
+    for n, view in enumerate(views):
+        tell(f"decoding {view.plan.camera}", n / (len(views) + 1))
+        frames = list(view.frames)
+        decoded, grid = scan_view(replace(view, frames=frames), rig, s)
+        grids.append(grid)
+        if board is not None:
+            try:
+                mean = phase.mean_picture(frames, view.plan)
+                sightings.append(calibrate.see(decoded, mean, view.plan, board, "this capture", s.board))
+            except CalibrationError as e:
+                doubts.append(f"{view.plan.camera}: {e}")
+    tell("comparing", len(views) / (len(views) + 1))
+    if board is not None and not sightings and must_see_board:
+        raise CalibrationError(f"the board was found in no view; {doubts[0]}")
+    trueness = None
+    if board is not None and sightings:
+        try:
+            trueness = evaluate.board_trueness(grids, sightings, board, rig)
+        except EmptyResultError as e:
+            doubts.append(str(e))
+    radius_um = None
+    if sphere_mm is not None:
+        points = np.concatenate([g.xyz[g.valid] for g in grids])
+        radius_um = 1e3 * (evaluate.fit_sphere(points, sphere_mm).radius_mm - sphere_mm)
+    if not sightings:  # an ordinary specimen shows no board; that is no doubt
+        doubts = []
+    return evaluate.judge(rig, evaluate.agreement(grids, rig), s.verify, trueness, radius_um, tuple(doubts))
 
 
 def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:

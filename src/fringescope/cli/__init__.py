@@ -2,6 +2,7 @@
 
 from fringescope.cli.app import app, main, run
 from fringescope.cli.boards import board
+from fringescope.cli.calibrating import calibrate, verify
 from fringescope.cli.capturing import devices, import_, patterns, settings_, simulate
 from fringescope.cli.responding import response
 from fringescope.cli.scanning import decode, evaluate, export, reconstruct
@@ -10,6 +11,7 @@ from fringescope.cli.showing import demo
 __all__ = [
     "app",
     "board",
+    "calibrate",
     "decode",
     "demo",
     "devices",
@@ -23,4 +25,5 @@ __all__ = [
     "run",
     "settings_",
     "simulate",
+    "verify",
 ]

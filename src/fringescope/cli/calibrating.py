@@ -1,0 +1,253 @@
+"""Verbs that make a rig and ask whether it is still true: calibrate, verify."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fringescope import __version__
+from fringescope.cli.app import app
+from fringescope.cli.common import Force, Json, Out, Progress, SetOption, SettingsFile, emit, existing, load_settings
+from fringescope.errors import CalibrationError, UsageError
+
+if TYPE_CHECKING:
+    from fringescope import evaluate as judging
+    from fringescope.calibrate import Sizes
+    from fringescope.settings import Settings
+    from fringescope.store import Session
+    from fringescope.types import F32, U8, Board, Calibration, Evidence, Rig, Sighting
+
+# ----------------------------------------------------------------------------------------------------------- calibrate
+
+WIDEST = 1400  #: pixels of the pictures that are kept for the report
+
+
+@dataclass
+class Looked:
+    """What came of looking at a session: sightings, small pictures by "pose/camera", why the others show no board."""
+
+    seen: list[Sighting] = field(default_factory=list)
+    pictures: dict[str, F32] = field(default_factory=dict)
+    wrong: dict[str, str] = field(default_factory=dict)
+
+
+def look(session: Session, s: Settings, progress: Progress) -> Looked:
+    """Every picture of a session, one after the other, so that one view's frames are in memory."""
+    from fringescope import pipeline, store
+
+    out = Looked()
+    inputs = [(pose, v) for pose, capture in session.poses for v in store.view_inputs(capture)]
+    for pose, view in progress.track(inputs, "looking at the boards", len(inputs)):
+        name = f"{pose}/{view.plan.camera}"
+        found, mean, why = pipeline.see_board(view, session.board, pose, s)
+        out.pictures[name] = _reduced(mean)
+        if found is None:
+            out.wrong[name] = why
+        else:
+            out.seen.append(found)
+    return out
+
+
+def _reduced(mean: F32) -> F32:
+    """Means of n x n pixels, n even, so that a mosaic becomes grey; the picture itself where it is small."""
+    import numpy as np
+
+    h, w = mean.shape
+    n = -(-max(h, w) // WIDEST)
+    if n == 1 or min(h, w) < 4 * n:
+        return mean
+    n += n % 2
+    h, w = h // n * n, w // n * n
+    return np.asarray(mean[:h, :w].reshape(h // n, n, w // n, n).mean(axis=(1, 3)), dtype=np.float32)
+
+
+def overlays(looked: Looked, c: Calibration | None) -> dict[str, U8]:
+    """The pictures with what was found in them drawn in."""
+    from fringescope import report
+
+    sightings = {x.name: x for x in (c.sightings if c is not None else looked.seen)}
+    residuals = {f"{r.pose}/{r.camera}": r for r in (c.residuals if c is not None else ())}
+    out = {}
+    for name, image in looked.pictures.items():
+        pose, camera = name.split("/", 1)
+        seen = sightings.get(name) or _nothing(pose, camera, image)
+        out[name] = report.sighting_picture(image, seen, residuals.get(name))
+    return out
+
+
+def _nothing(pose: str, camera: str, image: F32) -> Sighting:
+    """A sighting without a board."""
+    import numpy as np
+
+    from fringescope.types import Sighting
+
+    two, one, index = np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), np.int32)
+    size = (image.shape[1], image.shape[0])
+    return Sighting(pose, camera, size, index, two, one, index, two, two, two, two, two, two, two)
+
+
+def rig_with_evidence(c: Calibration, evidence: Evidence, s: Settings) -> Rig:
+    """The solved rig, carrying in its file the board, the observations and the evidence."""
+    from fringescope import store
+    from fringescope.settings import to_dict
+
+    doc = store.calibration_document(c)
+    doc["calibration"] |= {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {"fringescope": __version__},
+        "settings": {k: v for k, v in to_dict(s).items() if k in ("board", "calibrate")},
+        "verdict": evidence.verdict,
+        "held_out": [asdict(p.held_out) for p in evidence.poses if p.held_out is not None],
+    }
+    return replace(c.rig, extra={**c.rig.extra, **doc})
+
+
+@app.command()
+def calibrate(
+    session: Annotated[
+        Path, typer.Argument(help="A folder with board.json and a capture per pose; or a rig.json, to solve it again.")
+    ],
+    out: Out,
+    report: Annotated[
+        Path | None, typer.Option(help="The report, a page for any browser; else beside the rig, as RIG.html.")
+    ] = None,
+    settings: SettingsFile = None,
+    set_: SetOption = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Board captures to a calibrated rig, with the evidence to trust it."""
+    from fringescope import pipeline, store
+    from fringescope import report as report_
+
+    s = load_settings(settings, set_)
+    existing(session, "a session: a folder with board.json and a capture per pose")
+    title = session.resolve().name
+    page = report if report is not None else out.with_suffix(".html")
+    if page.resolve() == out.resolve():
+        raise UsageError(f"--report {page} is the rig itself; name another file")
+    looked, failure = Looked(), ""
+    with Progress() as progress, store.new_file(page, force=force) as page_file:
+        try:
+            with store.new_file(out, force=force) as rig_file:
+                if session.is_file():
+                    board, sizes = _observations(session, looked)
+                else:
+                    found = store.read_session(session)
+                    board, sizes = found.board, _sizes(found)
+                    looked = look(found, s, progress)
+                why = [f"{name}: {why}" for name, why in looked.wrong.items()]
+                c, evidence = pipeline.calibrate_rig(looked.seen, board, sizes, s, progress.share, why)
+                store.write_json(rig_file, store.rig_document(rig_with_evidence(c, evidence, s)))
+                text = report_.calibration_page(
+                    c, evidence, c.sightings, None, overlays(looked, c), f"Calibration of {title}"
+                )
+                page_file.write_text(text, encoding="utf-8")
+        except CalibrationError as e:
+            failure = str(e)
+            text = report_.calibration_page(
+                None, None, looked.seen, failure, overlays(looked, None), f"Calibration of {title}"
+            )
+            page_file.write_text(text, encoding="utf-8")
+    if failure:
+        raise CalibrationError(f"{failure}; see {page}")
+    emit(_told(c, evidence, why, out, page), json, _lines(c, evidence, why, out, page))
+
+
+def _observations(rig: Path, looked: Looked) -> tuple[Board, Sizes]:
+    """The board, the sizes and, into `looked`, the sightings that a calibrated rig carries."""
+    from fringescope import store
+    from fringescope.calibrate import Sizes
+
+    board, stored = store.read_observations(rig)
+    looked.seen.extend(stored)
+    r = store.read_rig(rig)
+    cameras = {c.name: (c.lens.width, c.lens.height) for c in r.cameras}
+    return board, Sizes((r.projector.width, r.projector.height), r.projector.layout, cameras)
+
+
+def _sizes(session: Session) -> Sizes:
+    from fringescope.calibrate import Sizes
+
+    first = session.poses[0][1]
+    return Sizes((first.projector_width, first.projector_height), first.layout, dict(session.sizes))
+
+
+def _told(c: Calibration, evidence: Evidence, wrong: list[str], out: Path, page: Path) -> dict[str, Any]:
+    return {
+        "rig": str(out),
+        "report": str(page),
+        "verdict": evidence.verdict,
+        "good": list(evidence.good),
+        "weak": list(evidence.weak),
+        "next": list(evidence.next),
+        "poses": sorted(c.boards),
+        "left_out": [vars(x) for x in c.left_out],
+        "not_used": wrong,
+        "noise": dict(c.noise),
+        "figures": {**c.figures, **evidence.figures},
+    }
+
+
+def _lines(c: Calibration, evidence: Evidence, wrong: list[str], out: Path, page: Path) -> list[str]:
+    lines = [f"{out}: {evidence.verdict}; {len(c.boards)} poses, {len(c.rig.cameras)} cameras; report: {page}"]
+    lines += [f"without {w}" for w in wrong]
+    lines += [f"without {x.pose}{'/' + x.camera if x.camera else ''}"
+              f"{f' ({x.points} points)' if x.points else ''}: {x.why}" for x in c.left_out]  # fmt: skip
+    lines += [*evidence.good, *evidence.weak]
+    return lines + [f"next: {w}" for w in evidence.next]
+
+
+# -------------------------------------------------------------------------------------------------------------- verify
+
+
+def find_board(rig: Rig, capture: Path, board: Path | None) -> Board | None:
+    """The board of a capture: the file named, the one beside or above the capture, the one that the rig carries."""
+    from fringescope import store
+
+    folder = capture.parent if capture.is_file() else capture
+    if board is not None:
+        return store.read_board(board)
+    for place in (folder, folder.resolve().parent):
+        if (place / "board.json").is_file():
+            return store.read_board(place / "board.json")
+    carried = rig.extra.get("board")
+    return store.parse_board(carried, Path("rig.json")) if isinstance(carried, dict) else None
+
+
+@app.command()
+def verify(
+    capture: Annotated[Path, typer.Argument(help="A capture of the board, of a sphere, or of anything at all.")],
+    rig: Annotated[Path, typer.Option(help="The rig.json that is judged.")],
+    board: Annotated[
+        Path | None, typer.Option(help="board.json; else the one beside the capture, or that of the rig.")
+    ] = None,
+    sphere_mm: Annotated[float | None, typer.Option(help="Radius of a sphere that the capture shows, mm.")] = None,
+    settings: SettingsFile = None,
+    set_: SetOption = None,
+    json: Json = False,
+) -> None:
+    """Is this rig still true? Judged from one capture, with or without a board."""
+    from fringescope import pipeline, store
+
+    s = load_settings(settings, set_)
+    existing(capture, "a capture")
+    existing(rig, "a rig")
+    if sphere_mm is not None and not sphere_mm > 0:
+        raise UsageError(f"--sphere-mm {sphere_mm}; needed a positive radius in mm")
+    with Progress() as progress:
+        c, r = store.read_capture(capture), store.read_rig(rig)
+        store.check_rig(c, r)
+        wanted = find_board(r, capture, board)
+        found = pipeline.verify(
+            store.view_inputs(c), r, s, wanted, sphere_mm, must_see_board=board is not None, progress=progress.share
+        )
+    emit(found.to_dict(), json, _verdict_lines(found))
+
+
+def _verdict_lines(v: judging.Verdict) -> list[str]:
+    return [v.verdict, *v.words]
