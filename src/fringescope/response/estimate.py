@@ -116,9 +116,11 @@ class _Ripple:
         log, by = np.log(1 + x), self.dh[used].T @ (by_h / (1 + x))
         self._rows = np.concatenate([[1 + np.imag(slope / (1 + x))], [log.real], [log.imag], by.real, by.imag])
 
+        self._add, _ = model.table(self.h, o.steps, GRID // 2)
+
     def true(self, measured: F64) -> F64:
         """Measured phases (any number of turns) to true ones."""
-        return _true(self.h, self.steps, measured)
+        return _read(self._add, self.steps, measured)
 
     def at(self, phi: F64) -> _Set:
         """The error at true phases (n,)."""
@@ -131,8 +133,7 @@ class _Ripple:
         return _Set(phi, rows[0], rows[1], rows[2], rows[3 : 3 + n], rows[3 + n :])
 
 
-def _true(h: F64, steps: int, phase: F64) -> F64:
-    add, _ = model.table(h, steps)
+def _read(add: F64, steps: int, phase: F64) -> F64:
     at = np.mod(phase * steps / (2 * np.pi), 1.0) * len(add)
     return np.asarray(phase + np.interp(at, np.arange(len(add) + 1), np.append(add, add[0])))
 
@@ -150,8 +151,10 @@ def _wrap(x: F64) -> F64:
 def disagreement(pair: Pair, sets: tuple[Observed, ...], h_other: F64 | None, h_fine: F64 | None) -> F64:
     """By how much a pair's phases disagree, rad of the other set (n,), after correction by what each set shows."""
     other, fine = sets[pair.other], sets[pair.fine]
-    a = other.phase if h_other is None else _true(h_other, other.steps, other.phase)
-    b = pair.fine_phase if h_fine is None else _true(h_fine, fine.steps, pair.fine_phase)
+    a, b = other.phase, pair.fine_phase
+    if h_other is not None and h_fine is not None:
+        a = _read(model.table(h_other, other.steps)[0], other.steps, a)
+        b = _read(model.table(h_fine, fine.steps)[0], fine.steps, b)
     return _nearest_order(_wrap(a - pair.ratio * b), pair.ratio)
 
 

@@ -89,8 +89,12 @@ def excess(h: F64, steps: int, phi: F64) -> tuple[C128, C128, list[int], C128]:
     used = sorted({i for i, _ in fold})
     by_h = np.zeros((len(used), phi.size), np.complex128)
     slope = np.zeros(phi.size, np.complex128)
+    power = [np.ones(phi.size, np.complex128), np.exp(1j * steps * phi)]
+    while len(power) <= max((abs(order - 1) // steps for _, order in fold), default=0):
+        power.append(power[-1] * power[1])  # every term turns with a multiple of N phi
     for i, order in fold:
-        term = np.exp(1j * (order - 1) * phi)
+        turns = (order - 1) // steps
+        term = power[turns] if turns >= 0 else np.conj(power[-turns])
         by_h[used.index(i)] += term
         slope += h[i] * 1j * (order - 1) * term
     return np.asarray(h[used] @ by_h), slope, used, by_h
@@ -113,7 +117,7 @@ def table(h: F64, steps: int, size: int = TABLE) -> tuple[F64, F64]:
     Exact inverse of `phase_error`. Where the harmonics are so strong that the phase runs back, it is held instead.
     """
     ripple = 2 * math.pi / steps
-    phi = np.linspace(-0.5 * ripple, 1.5 * ripple, 4 * size + 1)
+    phi = np.linspace(-0.5 * ripple, 1.5 * ripple, 2 * size + 1)
     seen = np.maximum.accumulate(phi + phase_error(h, steps, phi)) + 1e-12 * np.arange(phi.size)
     at = np.arange(size) * (ripple / size)
     add = np.interp(at, seen, phi) - at
