@@ -133,7 +133,7 @@ def predict(calibration: Calibration) -> Prediction | None:
         {c.name: _figures(spread[v][seen[v]]) for v, c in enumerate(rig.cameras)},
         _between(rig, moves, seen, rho, volume.axes[2]),
         {c.name: _slices(spread[v], volume) for v, c in enumerate(rig.cameras)},
-        float(1e6 * np.sqrt(max(scale @ rho @ scale, 0.0))),
+        float(1e6 * np.sqrt(max(float(scale @ rho @ scale), 0.0))),
     )
 
 
