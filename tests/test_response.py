@@ -349,6 +349,32 @@ def test_the_twins_ripple_goes(preset: str) -> None:
     assert after <= before / 10
 
 
+def test_harmonics_are_no_noise() -> None:
+    view, rig = twin_view(1.6, (4, 4))
+    d, grid = scanned(view, rig, None)
+    straight, _ = scanned(*twin_view(1.0, (4, 4)), None)
+    assert grid.valid.mean() < 0.1  # every pixel looks too noisy to use
+    r = response.from_fringes(d, view.frames, view.plan, SMALL, (8 / 255, 247 / 255))
+    mended, grid = scanned(view, rig, r)
+    assert grid.valid.mean() > 0.5
+    A = np.float32([np.median(straight.background)])
+    assert mended.noise.variance(A)[0] == pytest.approx(straight.noise.variance(A)[0], rel=0.8)
+    assert np.median(mended.sets[-1].sigma) < 2 * np.median(straight.sets[-1].sigma)
+    assert response.corrected(straight, r).noise.variance(A)[0] <= 1.01 * straight.noise.variance(A)[0]
+
+
+@pytest.mark.parametrize("steps", [4, 5, 8])
+def test_power_beside_the_fringe_is_that_of_a_fit(steps: int) -> None:
+    h, phi = response.gamma_harmonics(2.0), np.linspace(0, 6, 7)
+    theta = phi[:, None] - 2 * np.pi * np.arange(steps) / steps
+    light = (0.5 + 0.5 * np.cos(theta)) ** 2.0
+    amplitude = 0.5  # ((1 + cos) / 2)^2 = 3/8 + cos / 2 + cos 2 / 8
+    design = np.column_stack([np.ones(steps), np.cos(2 * np.pi * np.arange(steps) / steps),
+                              np.sin(2 * np.pi * np.arange(steps) / steps)])  # fmt: skip
+    left = [np.linalg.lstsq(design, row, rcond=None)[1].sum() / (steps - 3) for row in light]
+    np.testing.assert_allclose(response.residual_power(h, steps, phi), np.array(left) / amplitude**2, atol=2e-6)
+
+
 def test_the_linear_twin_needs_nothing_and_a_blown_one_is_told() -> None:
     view, rig = twin_view(1.0, (3, 3))
     d, _ = scanned(view, rig, None)

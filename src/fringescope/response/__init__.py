@@ -7,7 +7,6 @@ phases from its error before their orders are settled; `predistortion` is the ta
 from fringescope.response.judge import from_exponents, from_fringes, from_sets
 from fringescope.response.model import (
     correct,
-    corrected,
     curve,
     drawn_to_power,
     gamma_harmonics,
@@ -19,6 +18,7 @@ from fringescope.response.model import (
     predistortion,
     table,
 )
+from fringescope.response.noise import corrected, residual_power
 from fringescope.response.ripple import Ripple, plane_ripple
 from fringescope.response.staircase import from_staircase
 
@@ -40,5 +40,6 @@ __all__ = [
     "plane_ripple",
     "predicted_errors",
     "predistortion",
+    "residual_power",
     "table",
 ]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fringescope.kernels import response as k
-from fringescope.types import F64, U8, Decoded, Response, WrappedSet
+from fringescope.types import F64, U8, Response, WrappedSet
 
 TERMS = 24  #: harmonics that a power law is expanded to
 NODES = 512  #: samples of a curve for its expansion
@@ -142,13 +142,6 @@ def correct(wrapped: WrappedSet, response: Response) -> WrappedSet:
     phase, sigma = np.empty_like(wrapped.phase), np.empty_like(wrapped.sigma)
     k.correct(wrapped.phase, wrapped.sigma, wrapped.steps, add, slope, phase, sigma)
     return replace(wrapped, phase=phase, sigma=sigma)
-
-
-def corrected(decoded: Decoded, response: Response | None) -> Decoded:
-    """A measured view with every set corrected; to be called before the orders are settled. None changes nothing."""
-    if response is None or not response.needed:
-        return decoded
-    return replace(decoded, sets=tuple(correct(w, response) for w in decoded.sets))
 
 
 # --------------------------------------------------------------------------------------------------- curves and tables
