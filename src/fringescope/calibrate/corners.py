@@ -69,7 +69,7 @@ def find(image: F32, weights: F64, saturated: Bool, board: Board, name: str, s: 
             break  # every place of the board was looked at
     least = max(4, min(9, wanted // 2))
     if best is None or len(best.px) < least:
-        if failure:
+        if failure:  # the first one: of the finest look at it
             raise CalibrationError(failure)
         seen = 0 if best is None else len(best.px)
         raise CalibrationError(
@@ -139,7 +139,7 @@ def _refine(
         why = _judge(out, start, (step1, step2), signs, saturated, s)
         good = why == ""
         if good.sum() < 4 or np.ptp(points[good], axis=0).min() < 1:
-            raise CalibrationError(f"{name}: no board found: {int(good.sum())} corners could be fitted" + _summary(why))
+            raise CalibrationError(_unusable(why, name))
         if turn == 2:
             _, miss = fit_map(points[good].astype(np.float64), out[good, :2], out[good, SIGMA])
             scale = np.maximum(float(np.median(miss)), out[good, SIGMA])
@@ -156,9 +156,13 @@ def _refine(
     return Corners(points[good], fit[:, :2], fit[:, SIGMA], fit[:, LEVEL], fit[:, HALF], dark, blur, smooth, words)
 
 
-def _summary(why: AnyArray) -> str:
+def _unusable(why: AnyArray, name: str) -> str:
     counts = Counter(str(w) for w in why if w)
-    return "".join(f"; {n} {w}" for w, n in counts.most_common(3))
+    if counts["saturated"] > 0.5 * len(why):
+        return f"{name}: the board is saturated ({counts['saturated']} of {len(why)} corners); expose it less"
+    listed = "".join(f"; {n} {w}" for w, n in counts.most_common(3))
+    good = len(why) - sum(counts.values())
+    return f"{name}: no board found: {good} of {len(why)} likely corners are some{listed}; show it in focus, evenly lit"
 
 
 def _trim(index: I32, board: Board) -> I32:

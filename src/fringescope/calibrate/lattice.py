@@ -14,6 +14,7 @@ STEPS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  #: in the order in which a
 NEIGHBOURS = 40  #: candidates around one that may be its neighbour on the lattice
 CONE = np.radians(14.0)
 SWAP = np.radians(25.0)
+LEAP = 1.6  #: a link this much longer than the next on its line leaves out a corner
 NEAR = 0.2  #: squares: a candidate this near to a lattice point belongs to it
 
 
@@ -213,7 +214,21 @@ def _links(s: Saddles) -> I32:
         back = np.argmin(_apart(slots[other], slots[has, slot, None] + np.pi, 2 * np.pi), axis=1)
         good = to[other, back] == has
         mutual[has[good], slot] = other[good]
-    return mutual
+    return _without_leaps(s, slots, mutual)
+
+
+def _without_leaps(s: Saddles, slots: F64, link: I32) -> I32:
+    """Without links much longer than the next one along the same line: they leap over hidden corners."""
+    length = np.where(link >= 0, np.hypot(*np.moveaxis(s.place[link] - s.place[:, None], -1, 0)), np.inf)
+    out = link.copy()
+    for slot in range(4):
+        has = np.flatnonzero(link[:, slot] >= 0)
+        other = link[has, slot]
+        on = np.argmin(_apart(slots[other], slots[has, slot, None], 2 * np.pi), axis=1)
+        leap = length[has, slot] > LEAP * np.minimum(length[has, (slot + 2) % 4], length[other, on])
+        out[has[leap], slot] = -1
+        out[other[leap], (on[leap] + 2) % 4] = -1
+    return out
 
 
 def _walk(seed: int, s: Saddles, link: I32) -> tuple[I32, I32]:
@@ -259,7 +274,7 @@ def complete(s: Saddles, member: I32, index: I32, rounds: int = 12) -> tuple[I32
             near: Bool = np.asarray(np.abs(ij - at).max(1) < NEAR)
         near &= _same_look(s, smooth, ij, at, parity)
         near[member] = False
-        near &= _beside(at, index, 2.0)
+        near &= _beside(at, index, 2.5)
         order = np.flatnonzero(near)[np.argsort(np.abs(ij - at).max(1)[near])]
         new, first = np.unique(at[order].astype(np.int32), axis=0, return_index=True)
         known = {tuple(x) for x in index.tolist()}

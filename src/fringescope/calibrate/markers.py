@@ -30,7 +30,7 @@ def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, t
     where = _positions(board)
     seen = _read(found, image, board, words)
     votes = _votes(seen, where)
-    if not votes:
+    if not votes or max(votes.values()) < 2:
         raise CalibrationError(_why_none(found, image, board, name))
     (best, count), *rest = votes.most_common(2)
     turn = _turn(best)
@@ -76,7 +76,7 @@ def _read(found: Corners, image: F32, board: Board, words: Any, mirrored: bool =
         border = np.concatenate([bits[0], bits[-1], bits[1:-1, 0], bits[1:-1, -1]])
         if border.mean() > 0.2:
             continue
-        ok, marker, quarter = words.identify(bits[1:-1, 1:-1].copy(), 0.5)
+        ok, marker, quarter = words.identify(bits[1:-1, 1:-1].copy(), 0.25)
         if ok:
             out.append((square, int(marker), int(quarter)))
     return out

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from fringescope.calibrate.corners import Corners
@@ -60,6 +61,7 @@ def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, t
     By the lattice's extent, by the board's ends where they are in view, and by the colours: square (0, 0) is black
     where the colours tell the ends apart. Raises CalibrationError if the lattice is not that of the board.
     """
+    _plain(found, image, name)
     possible = turns(found.index, board.inner_corners)
     ends = _ends(found, image)
     extent = np.ptp(found.index, axis=0) + 1
@@ -84,6 +86,25 @@ def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, t
         return best, ()
     of = f"{board.inner_corners[0]} x {board.inner_corners[1]}"
     return best, (f"{extent[0]} x {extent[1]} of {of} inner corners are in view: {len(chosen)} {OPEN}",)
+
+
+def _plain(found: Corners, image: F32, name: str) -> None:
+    """Raise CalibrationError if most white squares hold something dark."""
+    low, high = found.index.min(0), found.index.max(0)
+    squares = np.array([(c, r) for r in range(low[1] + 1, high[1] + 1) for c in range(low[0] + 1, high[0] + 1)])
+    squares = squares[found.is_white(squares)]
+    if not len(squares):
+        return
+    t = np.linspace(-0.3, 0.3, 9)
+    grid = np.stack(np.meshgrid(t, t), -1).reshape(-1, 2)
+    p = found.smooth((squares[:, None] - 0.5 + grid).reshape(-1, 2)).astype(np.float32)
+    v = cv2.remap(image, p[:, :1], p[:, 1:], cv2.INTER_LINEAR).reshape(len(squares), -1)
+    dark = (v < float(np.median(found.level))).mean(1)
+    if float(np.median(dark)) > 0.15 and float((v.max(1) > np.median(found.level)).mean()) > 0.5:
+        raise CalibrationError(
+            f"{name}: most white squares hold something dark (markers?), board.json says a plain chequerboard; "
+            "give pattern, marker_mm and dictionary of the ChArUco board"
+        )
 
 
 def _untidiness(t: Turn, found: Corners, board: Board) -> tuple[float, ...]:
