@@ -172,6 +172,7 @@ class CalibrateSettings(_Section):
     lens: str = knob("auto", "", "distortion of the cameras: none, k1, k1 k2, k1 k2 p1 p2, k1 k2 p1 p2 k3; auto = chosen by leaving poses out", "III-B")
     projector_lens: str = knob("auto", "", "distortion of the projector, likewise", "III-B")
     lens_gain: float = knob(2.0, "", "how much better a lens term must make the poses left out, in chi-squared per term, to be used", "", 0)
+    lens_confidence: float = knob(0.9, "", "one-sided confidence at which more lens terms must make the poses left out fit better", "", 0.5, 0.9999)
     projector: str = knob("samples", "", "what ties the projector: samples (phase at fixed camera pixels), centres (of white squares) or corners (phase read there)", "III-B, Fig. 4")
     board_shape: str = knob("flat", "", "what the board may be but flat and true: flat, bend, print (spacing of rows over that of columns, shear), bend print", "")
     bend_prior_mm: float = knob(0.3, "mm", "standard deviation of a board's sag at its corners, where it may bend", "", 1e-6)

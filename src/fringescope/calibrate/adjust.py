@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.stats import t as student
 
 from fringescope.calibrate.problem import (
     CORNERS,
-    DEVICE,
     PHASE,
     Block,
     Problem,
@@ -48,8 +48,8 @@ Key = tuple[int, str]
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Factors on the given sigmas and design effects, per camera and kind; `own` factors of pictures that are worse than
-    the camera's others, per sighting and kind.
+    """Factors on the given sigmas and design effects, per camera and kind; `own` factors of pictures that are worse
+    than the camera's others, per sighting and kind.
     """
 
     factor: Mapping[Key, float]
@@ -114,7 +114,7 @@ def released(
     free = np.zeros((problem.n_full, len(columns)))
     for j, rows in enumerate(columns):
         free[list(rows), j] = 1
-    held = free.any(axis=1)
+    held = np.asarray(free.any(axis=1))
     return replace(problem, free=free, priors={i: v for i, v in priors.items() if held[i]})
 
 
@@ -149,7 +149,8 @@ def _told(problem: Problem, text: str, name: str) -> dict[int, tuple[list[float]
         device, _, rest = part.partition("=")
         value, _, sigma = rest.partition("+-")
         if device.strip() not in problem.sizes.devices:
-            raise UsageError(f"setting {name}: no device '{device.strip()}'; there are {', '.join(problem.sizes.devices)}")
+            there = ", ".join(problem.sizes.devices)
+            raise UsageError(f"setting {name}: no device '{device.strip()}'; there are {there}")
         try:
             numbers, e = [float(v) for v in value.split(",")], float(sigma) if sigma else 1e-3
         except ValueError as error:
@@ -173,8 +174,8 @@ def robust_noise(problem: Problem, found: list[F64]) -> Noise:
     values: dict[Key, list[F64]] = {}
     for b, r in zip(problem.blocks, found, strict=True):
         values.setdefault(b.key, []).append(np.abs(r / b.sigma)[np.isfinite(r)])
-    return Noise({k: max(NORMAL_MAD * float(np.median(np.concatenate(v))), 1e-9) for k, v in values.items() if sum(map(len, v))}
-                 | {k: 1.0 for k, v in values.items() if not sum(map(len, v))})  # fmt: skip
+    every = {k: np.concatenate(v) for k, v in values.items()}
+    return Noise({k: max(NORMAL_MAD * float(np.median(v)), 1e-9) if len(v) else 1.0 for k, v in every.items()})
 
 
 def soft_weights(problem: Problem, found: list[F64], noise: Noise) -> list[F64]:
@@ -195,7 +196,7 @@ def hard_weights(problem: Problem, found: list[F64], noise: Noise, limit: float)
         with np.errstate(invalid="ignore"):
             ok = np.abs(r / noise.spread(b)) <= limit
         if b.points:
-            ok = np.repeat(ok.all(axis=1)[:, None], r.shape[1], axis=1)
+            ok = np.repeat(np.all(ok, axis=1, keepdims=True), r.shape[1], axis=1)
         out.append(np.where(ok, 1 / noise.variance(b), 0.0))
     return out
 
@@ -225,7 +226,7 @@ def polish(problem: Problem, state: State, noise: Noise, s: CalibrateSettings, t
 
 
 def components(problem: Problem, state: State, weights: Weights, noise: Noise) -> Noise:
-    """Variance components: each camera's and kind's sum of squares over its redundancy (Foerstner 1979); design effects."""
+    """Variance components (Foerstner 1979): a camera's and kind's sum of squares over its redundancy; design effects."""
     H, _ = folded(problem, normal(problem, state, weights))
     inverse, _ = inverse_normal(H)
     S = problem.free
@@ -237,16 +238,14 @@ def components(problem: Problem, state: State, weights: Weights, noise: Noise) -
         taken = float(np.sum((Sb.T @ Hb @ Sb) * inverse))
         squares[b.key] = squares.get(b.key, 0.0) + c * noise.effect.get(b.key, 1.0)
         count[b.key] = count.get(b.key, 0.0) + float((w > 0).sum()) - taken * noise.effect.get(b.key, 1.0)
-    factor = {
-        k: max(noise.factor[k] * float(np.sqrt(squares[k] / max(count[k], 1.0))), 1e-9) if count[k] > 1 else noise.factor[k]
-        for k in squares
-    }
+    ratio = {k: float(np.sqrt(squares[k] / count[k])) if count[k] > 1 else 1.0 for k in squares}
+    factor = {k: max(noise.factor[k] * r, 1e-9) for k, r in ratio.items()}
     again = Noise(factor, noise.effect, noise.own)
     return Noise(factor, design_effects(problem, state, weights, again), noise.own)
 
 
 def own_factors(problem: Problem, found: list[F64], noise: Noise) -> dict[Key, float]:
-    """How much worse than the camera's factor says each picture is, where it is (by medians, of 12 residuals at least)."""
+    """How much worse than the camera's factor says a picture is, where it is: by medians of 12 residuals or more."""
     out: dict[Key, float] = {}
     for b, r in zip(problem.blocks, found, strict=True):
         z = np.abs(r / (noise.factor[b.key] * b.sigma))
@@ -277,8 +276,9 @@ def design_effects(problem: Problem, state: State, weights: Weights, noise: Nois
                     continue
                 z = e.residual[ok, a] / noise.spread(b)[ok, a]
                 _, which = np.unique(where[ok], axis=0, return_inverse=True)
-                n = np.bincount(which.ravel()).astype(np.float64)
-                sums.setdefault((b.key, k), []).append((n, np.bincount(which.ravel(), z), z * z))
+                n = np.asarray(np.bincount(which.ravel()), dtype=np.float64)
+                total = np.asarray(np.bincount(which.ravel(), z), dtype=np.float64)
+                sums.setdefault((b.key, k), []).append((n, total, z * z))
     out: dict[Key, float] = {}
     for (key, _), parts in sums.items():
         n, total = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
@@ -302,7 +302,7 @@ def held_out_scores(problem: Problem, fit: Fit) -> F64:
     H, g = folded(problem, normal(problem, fit.state, fit.weights))
     out = np.full(len(problem.poses), np.nan)
     for p, (Hp, gp, cp) in shares.items():
-        own = S[problem.pose_at(p) : problem.pose_at(p) + 6].any(axis=0)
+        own = np.asarray(S[problem.pose_at(p) : problem.pose_at(p) + 6].any(axis=0))
         rest = ~own
         step = np.zeros(len(g))
         step[rest] = damped_step((H - Hp)[np.ix_(rest, rest)], (g - gp)[rest], 0.0)
@@ -324,11 +324,12 @@ def _pose_share(problem: Problem, fit: Fit, pose: int) -> tuple[F64, F64, float]
     return S.T @ H @ S, S.T @ g, c
 
 
-def chosen_models(problem: Problem, state: State, s: CalibrateSettings) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
-    """The lens model of every device, and the chi-squared of poses left out that each model gives, relative to the best.
+def chosen_models(
+    problem: Problem, state: State, s: CalibrateSettings
+) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
+    """The lens model of every device, and each model's chi-squared of the poses left out, relative to the chosen one's.
 
-    Device by device, the others as they stand, twice over; a term must earn `lens_gain`. Models named in the settings
-    stand.
+    Device by device, the others as they stand, twice over; see `simplest`. Models named in the settings stand.
     """
     devices = problem.sizes.devices
     asked = [s.projector_lens, *[s.lens] * (len(devices) - 1)]
@@ -337,7 +338,7 @@ def chosen_models(problem: Problem, state: State, s: CalibrateSettings) -> tuple
             raise UsageError(f"setting lens: '{name}'; needed auto or one of: {', '.join(MODELS)}")
     models = tuple(USUAL if name == "auto" else name for name in asked)
     told: dict[str, dict[str, float]] = {}
-    tried: dict[tuple[str, ...], tuple[float, State]] = {}
+    tried: dict[tuple[str, ...], F64] = {}
     base = replace_models(problem, state, models, s)
     noise = robust_noise(base[0], residuals(base[0], base[1]))
     first = polish(base[0], base[1], noise, s, turns=2)
@@ -346,17 +347,19 @@ def chosen_models(problem: Problem, state: State, s: CalibrateSettings) -> tuple
         for d, name in enumerate(asked):
             if name != "auto":
                 continue
-            scores = {m: _score(problem, first, models[:d] + (m,) + models[d + 1 :], s, tried) for m in MODELS}
-            worth = {m: c + s.lens_gain * len(MODELS[m]) for m, c in scores.items()}
-            best = min(worth, key=lambda m: worth[m])
-            told[devices[d]] = {m: round(c - scores[best], 3) for m, c in scores.items()}
-            models = models[:d] + (best,) + models[d + 1 :]
+            scores = {m: _score(problem, first, (*models[:d], m, *models[d + 1 :]), s, tried) for m in MODELS}
+            best = simplest(scores, s.lens_gain, s.lens_confidence)
+            total = {m: float(np.nansum(c)) for m, c in scores.items()}
+            told[devices[d]] = {m: round(c - total[best], 3) for m, c in total.items()}
+            models = (*models[:d], best, *models[d + 1 :])
         if models == before:
             break
     return models, told
 
 
-def replace_models(problem: Problem, state: State, models: tuple[str, ...], s: CalibrateSettings) -> tuple[Problem, State]:
+def replace_models(
+    problem: Problem, state: State, models: tuple[str, ...], s: CalibrateSettings
+) -> tuple[Problem, State]:
     """The problem with other lens models released, and the state with the terms that they lack at zero."""
     lens = state.lens.copy()
     for d, m in enumerate(models):
@@ -365,19 +368,39 @@ def replace_models(problem: Problem, state: State, models: tuple[str, ...], s: C
     return released(problem, models, s), replace(state, lens=lens)
 
 
+def simplest(scores: Mapping[str, F64], gain: float, confidence: float) -> str:
+    """The simplest model whose poses left out fit as well as the best model's, but for chance.
+
+    `scores` holds each model's chi-squared per pose. As good means: worse by no more than `gain` per term saved, plus
+    what the spread of the difference over the poses allows at this one-sided `confidence` (after the one-standard-error
+    rule: Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, 2nd edition, section 7.10). Every lens
+    has some distortion, so "none" gets no benefit of this doubt.
+    """
+    total = {m: float(np.nansum(c)) for m, c in scores.items()}
+    best = min(total, key=lambda m: total[m])
+    for m in sorted(scores, key=lambda m: len(MODELS[m])):
+        more = scores[m] - scores[best]
+        more = more[np.isfinite(more)]
+        error = float(np.sqrt(len(more)) * np.std(more, ddof=1)) if len(more) > 1 and MODELS[m] else 0.0
+        error *= float(student.ppf(confidence, max(len(more) - 1, 1)))
+        saved = max(len(MODELS[best]) - len(MODELS[m]), 0)
+        if len(more) and total[m] - total[best] <= gain * saved + error:
+            return m
+    return best
+
+
 def _score(
-    problem: Problem, first: Fit, models: tuple[str, ...], s: CalibrateSettings,
-    tried: dict[tuple[str, ...], tuple[float, State]],
-) -> float:  # fmt: skip
+    problem: Problem, first: Fit, models: tuple[str, ...], s: CalibrateSettings, tried: dict[tuple[str, ...], F64]
+) -> F64:
+    """Chi-squared of every pose left out under these lens models; infinite where they cannot be solved."""
     if models not in tried:
         p, state = replace_models(problem, first.state, models, s)
-        weights = first.weights
         try:
-            state, n = minimise(p, state, weights, s.rounds, 1e-4)
-            tried[models] = float(np.nansum(held_out_scores(p, Fit(state, first.noise, weights, n)))), state
+            state, n = minimise(p, state, first.weights, s.rounds, 1e-4)
+            tried[models] = held_out_scores(p, Fit(state, first.noise, first.weights, n))
         except (CalibrationError, np.linalg.LinAlgError):
-            tried[models] = np.inf, first.state
-    return tried[models][0]
+            tried[models] = np.full(len(problem.poses), np.inf)
+    return tried[models]
 
 
 def thinned(problem: Problem, most: int) -> Problem:
@@ -388,7 +411,3 @@ def thinned(problem: Problem, most: int) -> Problem:
     ]
     return replace(problem, blocks=tuple(blocks))
 
-
-def lens_columns(problem: Problem, device: int) -> range:
-    """Where a device's lens and pose stand in the full vector."""
-    return range(problem.device_at(device), problem.device_at(device) + DEVICE)

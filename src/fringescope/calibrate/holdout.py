@@ -1,4 +1,4 @@
-"""Is a rig true for boards that it was not made from? A pose fitted with the rig held fixed; each pose left out in turn."""
+"""Is a rig true for boards that it was not made from? A pose fitted by a rig held fixed; each pose left out in turn."""
 
 from __future__ import annotations
 
@@ -65,8 +65,9 @@ def fit_board(
     known = {c.name for c in rig.cameras}
     mine = tuple(n for n in sightings if n.camera in known and len(n.corner) >= 4)
     if not mine or len({n.pose for n in mine}) != 1:
+        poses = len({n.pose for n in mine})
         raise CalibrationError(
-            f"{len(mine)} sightings of {len({n.pose for n in mine})} poses by cameras of the rig; needed those of one pose"
+            f"{len(mine)} sightings of {poses} poses by cameras of the rig; needed those of one pose"
         )
     problem = make_problem(mine, board, sizes_of(rig), s)
     state = state_of(rig, {}, problem.poses, np.zeros(len(SHAPE)))
@@ -84,7 +85,7 @@ def fit_board(
                 geometry.inverse(rig.projector.pose), Pose(fitted.board_R[0], fitted.board_t[0])
             )
             return T_world_board, _missed(problem, fitted, mine, s)
-    raise CalibrationError(f"{mine[0].pose}: no place of the board explains its corners with this rig; is it this rig's?")
+    raise CalibrationError(f"{mine[0].pose}: no place of the board explains its corners; are they of this rig?")
 
 
 def _missed(problem: Problem, state: State, mine: Sequence[Sighting], s: CalibrateSettings) -> tuple[Residuals, ...]:
@@ -179,7 +180,8 @@ def rig_of(rig: Rig, state: State) -> Rig:
     cameras = []
     for d, c in enumerate(rig.cameras, start=1):
         fx, fy, cx, cy = state.lens[d, :4]
-        lens = replace(c.lens, K=np.array([[fx, state.skew[d], cx], [0, fy, cy], [0, 0, 1]]), distortion=state.lens[d, 4:])
+        K = np.array([[fx, state.skew[d], cx], [0, fy, cy], [0, 0, 1]])
+        lens = replace(c.lens, K=K, distortion=state.lens[d, 4:])
         cameras.append(Camera(c.name, lens, geometry.compose(Pose(state.R[d], state.t[d]), rig.projector.pose)))
     fx, fy, cx, cy = state.lens[0, :4]
     p = rig.projector

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fringescope.calibrate.problem import CORNERS, Block, Problem, State
 from fringescope.errors import CalibrationError
@@ -65,7 +66,8 @@ def begin(problem: Problem, focal: dict[int, float], pinned: dict[int, tuple[flo
     seen = [s for s in _gather(problem) if s is not None]
     lenses = {c: _camera(problem, c, seen, focal.get(c), pinned.get(c)) for c in sorted({s.camera for s in seen})}
     seen = [_with_readings(s, lenses[s.camera]) for s in seen]
-    tied = {c: _tie(problem, [s for s in seen if s.camera == c], lenses[c], focal.get(0), pinned.get(0)) for c in lenses}
+    by_camera = {c: [s for s in seen if s.camera == c] for c in lenses}
+    tied = {c: _tie(problem, by_camera[c], lens, focal.get(0), pinned.get(0)) for c, lens in lenses.items()}
     found = {c: t for c, t in tied.items() if t is not None}
     if not found:
         raise CalibrationError(
@@ -100,18 +102,19 @@ def _from_map(H: F64, xy: F64, px: F64) -> F64:
         return np.asarray(np.linalg.norm(q[:, :2] / q[:, 2:] - px, axis=1))
 
 
-def _spread(n: int, most: int) -> F64:
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
+def _spread(n: int, most: int) -> NDArray[np.intp]:
+    """At most `most` of n numbers, evenly."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.intp))
 
 
-def projector_coordinates(b: Block) -> tuple[F64, F64]:
+def projector_coordinates(b: Block) -> tuple[NDArray[np.intp], F64]:
     """Rows of a block of samples that two directions at least were measured at, and (u, v) there (n, 2)."""
     if b.points:
         return np.arange(len(b.place)), b.place
     ok = np.isfinite(b.cycles)
     full = np.flatnonzero(ok.all(axis=1))
     if len(b.g) < 2 or not len(full) or np.linalg.matrix_rank(b.g / np.linalg.norm(b.g, axis=1)[:, None], tol=1e-3) < 2:
-        return np.zeros(0, dtype=int), np.zeros((0, 2))
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     return full, np.asarray(b.cycles[full] @ np.linalg.pinv(b.g).T)
 
 
@@ -137,7 +140,7 @@ def _seen(number: int, blocks: Sequence[Block]) -> Seen | None:
         if b.kind == CORNERS:
             continue
         rows, where = projector_coordinates(b)
-        pick = _spread(len(rows), POINTS) if len(rows) else np.zeros(0, dtype=int)
+        pick = _spread(len(rows), POINTS) if len(rows) else np.zeros(0, dtype=np.intp)
         at, uv = b.place[rows[pick]], where[pick]
         if b.points:  # measured at board points: their pixels by the map
             q = np.column_stack([b.xy[rows[pick]], np.ones(len(pick))]) @ H.T
@@ -151,7 +154,9 @@ _FIX_K = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
 _MONO = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | _FIX_K
 
 
-def _camera(problem: Problem, camera: int, seen: Sequence[Seen], focal: float | None, middle: tuple[float, float] | None) -> F64:
+def _camera(
+    problem: Problem, camera: int, seen: Sequence[Seen], focal: float | None, middle: tuple[float, float] | None
+) -> F64:
     """Nine numbers of a camera's lens from its corners alone: square pixels, centred, k1."""
     size = problem.sizes.extent(camera)
     mine = [s for s in seen if s.camera == camera]
@@ -223,7 +228,9 @@ class Tie:
     score: float
 
 
-def _tie(problem: Problem, seen: Sequence[Seen], lens: F64, focal: float | None, middle: tuple[float, float] | None) -> Tie | None:
+def _tie(
+    problem: Problem, seen: Sequence[Seen], lens: F64, focal: float | None, middle: tuple[float, float] | None
+) -> Tie | None:
     """The projector that explains most poses of one camera; None if there are fewer than two with phases."""
     able = [s for s in seen if s.readings and len(s.uv) >= 6]
     if len(able) < 2:
@@ -305,7 +312,7 @@ def _direct(xyz: F64, uv: F64) -> F64 | None:
     T3, T2 = np.diag([s3, s3, s3, 1.0]), np.diag([s2, s2, 1.0])
     T3[:3, 3], T2[:2, 2] = -s3 * m3, -s2 * m2
     P = np.linalg.inv(T2) @ vector[:, 0].reshape(3, 4) @ T3
-    return np.asarray(P * np.sign(np.median(np.column_stack([xyz, np.ones(len(xyz))]) @ P[2])) )
+    return np.asarray(P * np.sign(np.median(np.column_stack([xyz, np.ones(len(xyz))]) @ P[2])))
 
 
 def _inverse_camera(
@@ -353,7 +360,9 @@ def _guesses(
 # --------------------------------------------------------------------------------------------------- all together
 
 
-def _assemble(problem: Problem, lenses: dict[int, F64], seen: Sequence[Seen], found: dict[int, Tie], best: int) -> Start:
+def _assemble(
+    problem: Problem, lenses: dict[int, F64], seen: Sequence[Seen], found: dict[int, Tie], best: int
+) -> Start:
     D, P = len(problem.sizes.devices), len(problem.poses)
     lens, R, t = np.zeros((D, 9)), np.tile(np.eye(3), (D, 1, 1)), np.zeros((D, 3))
     main = found[best]
@@ -378,7 +387,8 @@ def _assemble(problem: Problem, lenses: dict[int, F64], seen: Sequence[Seen], fo
         _, board_R[p], board_t[p] = min(options, key=lambda o: o[0])
     normals = np.array([board_R[p][:, 2] for p in boards])
     readings = {s.sighting: s.readings for s in seen}
-    return Start(State(lens, R, t, board_R, board_t, np.zeros(5), np.zeros(D)), frozenset(trusted), _widest(normals), readings)
+    state = State(lens, R, t, board_R, board_t, np.zeros(5), np.zeros(D))
+    return Start(state, frozenset(trusted), _widest(normals), readings)
 
 
 def _widest(normals: F64) -> float:

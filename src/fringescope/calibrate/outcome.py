@@ -44,7 +44,10 @@ from fringescope.types import (
 )
 
 FACING = np.diag([1.0, -1.0, -1.0])  #: R_projector_world: x along u, z towards the projector
-UNITS = {**dict.fromkeys(LENS[:4], "px"), **dict.fromkeys(LENS[4:], ""), **dict.fromkeys(POSE[:3], "rad"), **dict.fromkeys(POSE[3:], "mm")}
+UNITS = {
+    **dict.fromkeys(LENS[:4], "px"), **dict.fromkeys(LENS[4:], ""), **dict.fromkeys(POSE[:3], "rad"),
+    **dict.fromkeys(POSE[3:], "mm"),
+}  # fmt: skip
 GROWN = 1.1  #: the measuring volume over what the boards filled
 
 
@@ -67,8 +70,8 @@ def calibration(
     H, _ = folded(problem, normal(problem, state, fit.weights))
     inverse, condition = inverse_normal(H)
     parameters, covariance = _parameters(problem, state, T_projector_world, inverse, rig)
-    rest, points, out = _residuals(problem, fit, used)
-    told = _figures(problem, fit, used, rig, points) | figures | {"condition": condition, "steps": fit.steps}
+    rest, out = _residuals(problem, fit, used)
+    told = _figures(problem, fit, used, rig) | figures | {"condition": condition, "steps": fit.steps}
     kept = {b.sighting for b in problem.blocks}
     seen = tuple(n for i, n in enumerate(used) if i in kept)
     words = _words(problem, parameters, s)
@@ -140,7 +143,7 @@ def _parameters(
     J = world_jacobian(problem, state, T_projector_world) @ problem.free
     full = J @ inverse @ J.T
     sigma = np.sqrt(np.maximum(np.diag(full), 0))
-    free = problem.free.any(axis=1)
+    free = np.asarray(problem.free.any(axis=1))
     out: list[Parameter] = []
     rows: list[int] = []
 
@@ -171,10 +174,9 @@ def _parameters(
 
 def _residuals(
     problem: Problem, fit: Fit, used: Sequence[Sighting]
-) -> tuple[tuple[Residuals, ...], dict[int, F64], tuple[LeftOut, ...]]:
-    """Residuals per sighting with NaN where left out; corners' raw residuals; words about points left out."""
+) -> tuple[tuple[Residuals, ...], tuple[LeftOut, ...]]:
+    """Residuals per sighting with NaN where left out; words about points left out."""
     corner: dict[int, F64] = {}
-    raw: dict[int, F64] = {}
     sample: dict[int, tuple[F64, F64]] = {}
     out: list[LeftOut] = []
     for b, w in zip(problem.blocks, fit.weights, strict=True):
@@ -183,20 +185,22 @@ def _residuals(
         s = used[b.sighting]
         gone = (w == 0).any(axis=1) & np.isfinite(e.residual).any(axis=1)
         if b.kind == CORNERS:
-            corner[b.sighting], raw[b.sighting] = r, e.residual
+            corner[b.sighting] = r
             if gone.any():
                 far = float(np.max(np.linalg.norm(e.residual[gone], axis=1)))
                 out.append(LeftOut(s.pose, s.camera, int(gone.sum()), f"corners up to {far:.2g} px off"))
             continue
         sample[b.sighting] = r, e.uv
         if gone.sum() > 0.01 * len(gone):
-            out.append(LeftOut(s.pose, s.camera, int(gone.sum()), f"phases that miss by more than {np.nanmax(np.abs(r)):.2g} units"))
+            why = f"phases that miss by more than {np.nanmax(np.abs(r)):.2g} units"
+            out.append(LeftOut(s.pose, s.camera, int(gone.sum()), why))
     rest = []
     for i in sorted(corner):
         s = used[i]
-        r, uv = sample.get(i, (np.full((len(s.sample_px), len(s.directions)), np.nan), np.full((len(s.sample_px), 2), np.nan)))
+        none = np.full((len(s.sample_px), len(s.directions)), np.nan), np.full((len(s.sample_px), 2), np.nan)
+        r, uv = sample.get(i, none)
         rest.append(Residuals(s.pose, s.camera, corner[i], r, uv))
-    return tuple(rest), raw, tuple(out)
+    return tuple(rest), tuple(out)
 
 
 def _noise(problem: Problem, fit: Fit) -> dict[str, float]:
@@ -209,14 +213,13 @@ def _noise(problem: Problem, fit: Fit) -> dict[str, float]:
     return out
 
 
-def _figures(problem: Problem, fit: Fit, used: Sequence[Sighting], rig: Rig, raw: dict[int, F64]) -> dict[str, Any]:
+def _figures(problem: Problem, fit: Fit, used: Sequence[Sighting], rig: Rig) -> dict[str, Any]:
     names = problem.sizes.devices
     rms: dict[str, float] = {}
-    taken = {
-        key: [r[w > 0] for b, w, r in zip(problem.blocks, fit.weights, residuals(problem, fit.state), strict=True) if b.key == key]
-        for key in sorted({b.key for b in problem.blocks})
-    }
-    for (d, kind), parts in taken.items():
+    taken: dict[tuple[int, str], list[F64]] = {}
+    for b, w, r in zip(problem.blocks, fit.weights, residuals(problem, fit.state), strict=True):
+        taken.setdefault(b.key, []).append(r[w > 0])
+    for (d, kind), parts in sorted(taken.items()):
         r = np.concatenate(parts)
         if len(r):
             rms[f"{names[d]} {kind} {'px' if kind == CORNERS else 'units'}"] = float(np.sqrt(np.mean(r * r)))
@@ -291,7 +294,7 @@ def read_at_corners(
 def _square_px(s: Sighting) -> float:
     """Side of a square in pixels, about."""
     span, steps = np.ptp(s.corner_px, axis=0), np.ptp(s.corner, axis=0)
-    return float(np.linalg.norm(span) / max(np.linalg.norm(steps), 1))
+    return float(np.linalg.norm(span)) / max(float(np.linalg.norm(steps)), 1.0)
 
 
 def _local(d: F64, uv: F64) -> tuple[F64, F64] | None:
@@ -321,14 +324,15 @@ def _words(problem: Problem, parameters: Sequence[Parameter], s: CalibrateSettin
         f = by.get((name, "fx")) or by.get((name, "f"))
         if f is not None and not f.fixed and f.sigma > 0.01 * f.value:
             out.append(
-                f"{name}: focal length known to {100 * f.sigma / f.value:.1f} % only; photograph the board tilted by 15 to "
-                "30 deg about both its axes, nearer and farther"
+                f"{name}: focal length known to {100 * f.sigma / f.value:.1f} % only; photograph the board tilted by "
+                "15 to 30 deg about both its axes, nearer and farther"
             )
         loose = (s.camera_centre_prior if d else s.projector_centre_prior) * max(problem.sizes.extent(d))
-        held = [c for c in ("cx", "cy") if (name, c) in by and not by[name, c].fixed and by[name, c].sigma > 0.5 * loose]
+        held = [c for c in ("cx", "cy") if not by[name, c].fixed and by[name, c].sigma > 0.5 * loose]
         if held:
             out.append(
-                f"{name}: {' and '.join(held)} held by the weak prior only; tilt the board more, and bring it into the corners"
+                f"{name}: {' and '.join(held)} held by the weak prior only; tilt the board more, and bring it into the "
+                "corners"
             )
     return out
 

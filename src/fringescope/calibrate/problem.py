@@ -55,7 +55,7 @@ class State:
     lens: F64
     R: F64
     t: F64
-    board_R: F64
+    board_R: F64  # noqa: N815
     board_t: F64
     shape: F64
     skew: F64

@@ -81,7 +81,8 @@ def solve(sightings: Sequence[Sighting], board: Board, sizes: Sizes, s: Calibrat
 
 def _able(sightings: Sequence[Sighting], sizes: Sizes) -> tuple[tuple[Sighting, ...], list[LeftOut]]:
     """Sightings that can be used at all, and why the others cannot."""
-    used, left = [], []
+    used: list[Sighting] = []
+    left: list[LeftOut] = []
     for n in sightings:
         if n.camera not in sizes.cameras:
             raise CalibrationError(f"{n.name}: no camera of that name; the session has {', '.join(sizes.cameras)}")
@@ -92,8 +93,8 @@ def _able(sightings: Sequence[Sighting], sizes: Sizes) -> tuple[tuple[Sighting, 
         elif len(n.corner) < FEWEST_CORNERS:
             why = f"{len(n.corner)} corners; needed {FEWEST_CORNERS}"
             left.append(LeftOut(n.pose, n.camera, None, why))
-        elif (why := _crooked(n)) is not None:
-            left.append(LeftOut(n.pose, n.camera, None, why))
+        elif (crooked := _crooked(n)) is not None:
+            left.append(LeftOut(n.pose, n.camera, None, crooked))
         else:
             used.append(n)
     names = [n.name for n in used]
@@ -156,13 +157,12 @@ def _enough(problem: Problem, s: CalibrateSettings, left: Sequence[LeftOut]) -> 
             + (f" (left out: {why})" if why else "")
         )
     if not any(b.kind == PHASE for b in problem.blocks):
-        raise CalibrationError("no picture has the projector's phase on the board in two directions; project both u and v")
+        raise CalibrationError("no picture has the projector's phase on the board; project fringes along both u and v")
     for c, name in enumerate(problem.sizes.cameras, start=1):
         n = len({b.pose for b in problem.blocks if b.device == c})
         if n < s.min_poses:
-            raise CalibrationError(
-                f"{name} has {n} usable poses of the board; needed {s.min_poses} at least" + (f" ({why})" if why else "")
-            )
+            because = f" (left out: {why})" if why else ""
+            raise CalibrationError(f"{name} has {n} usable poses of the board; needed {s.min_poses} at least{because}")
 
 
 def _tilted(problem: Problem, state: State, s: CalibrateSettings) -> None:
@@ -198,7 +198,8 @@ def _agreeing(
         part = restricted(coarse, trusted)
         if turn == 0:
             state, _ = settle(released(part, ("none",) * devices, s, centres=False), state, 3, 12)
-        problem, state = replace_models(part, state, tuple(USUAL if n == "auto" else n for n in _asked(s, devices)), s)
+        models = tuple(USUAL if n == "auto" else n for n in _asked(s, devices))
+        problem, state = replace_models(part, state, models, s)
         state, noise = settle(problem, state, 5 if turn == 0 else 3, 25)
         judged = [judge(coarse, state, noise, n, start.readings.get(n, ())) for n in range(len(used))]
         state, keep, out = verdicts(coarse, state, noise, judged, used, s)
@@ -214,8 +215,8 @@ def _asked(s: CalibrateSettings, devices: int) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """One sighting fitted alone by a rig: its board's pose, rms misfit over noise of corners and of phases (NaN = none),
-    and in units.
+    """One sighting fitted alone by a rig: its board's pose, rms misfit over noise of corners and of phases (NaN =
+    none), and in units.
     """
 
     R: F64
@@ -276,8 +277,9 @@ def fit_pose(problem: Problem, state: State, noise: Noise, pose: int, R: F64, t:
 
 
 def verdicts(
-    problem: Problem, state: State, noise: Noise, judged: Sequence[Judged], used: Sequence[Sighting], s: CalibrateSettings
-) -> tuple[State, set[int], list[LeftOut]]:
+    problem: Problem, state: State, noise: Noise, judged: Sequence[Judged], used: Sequence[Sighting],
+    s: CalibrateSettings,
+) -> tuple[State, set[int], list[LeftOut]]:  # fmt: skip
     """Who stays: sightings that fit alone, and of each pose those that agree on where the board is."""
     out: list[LeftOut] = []
     typical = _usual(judged, used)
@@ -288,7 +290,8 @@ def verdicts(
         if j.corners_px > s.reject_sighting * corner_px:
             bad.append(f"corners {j.corners_px:.2g} px off, others {corner_px:.2g}")
         if j.phases_units > s.reject_sighting * phase:
-            bad.append(f"phases {j.phases_units:.2g} units off, others {phase:.2g}: board moved, or another camera's pictures")
+            why = "the board moved, or another camera's pictures"
+            bad.append(f"phases {j.phases_units:.2g} units off, others {phase:.2g}: {why}")
         if bad:
             out.append(LeftOut(sighting.pose, sighting.camera, None, "; ".join(bad)))
         else:
@@ -335,11 +338,13 @@ def _together(
             return stay, fitted.board_R[pose], fitted.board_t[pose], gone
         if len(stay) == 1:
             return [], R, t, gone
-        rest = {n: _without(problem, state, noise, pose, [m for m in stay if m != n], judged, used, typical) for n in stay}
+        rest = {
+            n: _without(problem, state, noise, pose, [m for m in stay if m != n], judged, used, typical) for n in stay
+        }
         least = min(rest.values())
         out = min((n for n in stay if rest[n] <= 1.5 * least + 0.1), key=lambda n: len(used[n].corner))
         px = misses[out][1]
-        why = f"sees the board elsewhere than the pose's other cameras: corners {px:.2g} px off; numbered differently, or moved"
+        why = f"sees the board elsewhere than other cameras: corners {px:.2g} px off; numbered differently, or moved"
         gone.append(LeftOut(used[out].pose, used[out].camera, None, why))
         stay.remove(out)
     return [], np.eye(3), np.zeros(3), gone
@@ -385,11 +390,13 @@ def _late(
     members = {b.sighting for b in problem.blocks}
     found = residuals(problem, fit.state)
     rms = {(b.sighting, b.kind): (_typical(r), b) for b, r in zip(problem.blocks, found, strict=True)}
-    usual = {key: float(np.median([v for v, b in rms.values() if b.key == key])) for key in {b.key for _, b in rms.values()}}
+    keys = {b.key for b in problem.blocks}
+    usual = {key: float(np.median([v for v, b in rms.values() if b.key == key])) for key in keys}
     for (n, kind), (v, b) in rms.items():
         if v > s.reject_sighting * max(usual[b.key], 1e-6):
-            unit = "px" if kind == CORNERS else "units"
-            out.append(LeftOut(used[n].pose, used[n].camera, None, f"{'corners' if kind == CORNERS else 'phases'} {v:.2g} {unit} off, others {usual[b.key]:.2g}"))
+            what, unit = ("corners", "px") if kind == CORNERS else ("phases", "units")
+            why = f"{what} {v:.2g} {unit} off, others {usual[b.key]:.2g}"
+            out.append(LeftOut(used[n].pose, used[n].camera, None, why))
             members.discard(n)
     if not out:
         return fit, replace_models(problem, fit.state, models, s)[0], out

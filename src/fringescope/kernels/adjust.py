@@ -14,6 +14,7 @@ from numba import njit
 
 from fringescope.kernels.lens import distort_jacobian, from_plane
 
+
 @njit(cache=True, inline="always", error_model="numpy")
 def _by_terms(x, y, dx, dy):
     """Derivatives of the distorted x and y by k1, k2, p1, p2, k3."""
