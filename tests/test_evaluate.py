@@ -294,3 +294,21 @@ def test_figures_are_those_of_the_judge(tmp_path):
     assert ours.inliers == judged["good"]
     assert ours.flying_ppm == pytest.approx(judged["flying_ppm"])
     assert ours.form_um == pytest.approx(judged["form_um"], abs=0.1)  # tiles lie elsewhere
+
+
+def test_words_where_sigma_does_not_fit_the_errors():
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[0:60, 0:70] * 0.2
+    xyz = np.stack([x, y, rng.normal(0, 0.005, x.shape)], -1).reshape(-1, 3)
+    view, centres = np.zeros(len(xyz), int), np.array([[7.0, 6.0, 500.0]])
+
+    def told(points, sigma):
+        return ev.evaluate(points, "plane", (), np.full(len(points), sigma), view, centres).words
+
+    assert told(xyz, 0.005) == ()
+    assert "2.5 times what sigma says" in told(xyz, 0.002)[0]
+    assert "something smoothed" in told(xyz, 0.01)[0]
+    assert "give the rig" in ev.evaluate(xyz, "plane", (), np.full(len(xyz), 0.01), view).words[0]
+    smooth = xyz.copy()  # a row's points share half of their noise
+    smooth[1:, 2] = (xyz[1:, 2] + xyz[:-1, 2]) / 2
+    assert "errors of neighbours are alike" in told(smooth, 0.0035)[0]

@@ -306,7 +306,7 @@ def _evaluation(doc: dict[str, Any]) -> list[str]:
     lines += [f"centres of spheres {i + 1} and {j + 1}: {d:.4f} mm" for i, j, d in doc["center_distances_mm"]]
     if doc["sigma_ratio"] is not None:
         lines.append(f"error over sigma: {doc['sigma_ratio']:.2f} (1: the uncertainty is calibrated)")
-    return lines
+    return lines + list(doc["words"])
 
 
 FORMATS = ("stl", "obj", "pcd", "e57", "3mf", "ply", "glb")

@@ -6,18 +6,16 @@ waits for the exposure to pass. Faults can be injected to see that they are foun
 
 from __future__ import annotations
 
-import itertools
-import queue
 import threading
 import time
 import urllib.parse
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from fringescope.devices import base
-from fringescope.errors import DeviceLostError, DeviceTimeoutError, RejectedError, UsageError
+from fringescope.devices import base, virtual
+from fringescope.errors import DeviceLostError, DeviceTimeoutError, UsageError
 from fringescope.twin import presets, render, scene
 from fringescope.types import U8, AnyArray, PixelFormat, Rig
 
@@ -71,9 +69,9 @@ class World:
         self.faults = faults or Faults()
         self.renderer = render.Renderer(view, instrument, rays)
         self.ring = 0.0
+        self.line: virtual.TriggerLine[_Edge] = virtual.TriggerLine()
         self._clock_ns = 1_000_000_000
-        self._armed: dict[str, _SimulatedAcquisition] = {}
-        self._lock = threading.RLock()
+        self._lock = threading.Lock()
         self._render_lock = threading.Lock()
 
     def advance(self, ns: int) -> int:
@@ -82,26 +80,6 @@ class World:
             now = self._clock_ns
             self._clock_ns += ns
             return now
-
-    def attach(self, name: str, acquisition: _SimulatedAcquisition) -> None:
-        """Connects an armed camera to the trigger line. Raises RejectedError if it is armed already."""
-        with self._lock:
-            if name in self._armed:
-                raise RejectedError(f"{name} is armed already; cancel that acquisition first")
-            self._armed[name] = acquisition
-
-    def detach(self, name: str, acquisition: _SimulatedAcquisition) -> None:
-        """Takes an acquisition off the trigger line."""
-        with self._lock:
-            if self._armed.get(name) is acquisition:
-                del self._armed[name]
-
-    def raise_edge(self, edge: _Edge) -> None:
-        """An edge on the line: every armed camera sees it."""
-        with self._lock:
-            waiting = list(self._armed.values())
-        for a in waiting:
-            a.edge(edge)
 
     def picture(self, camera: str, edge: _Edge, settings: base.CameraSettings, key: int) -> AnyArray:
         """The frame that `camera` exposes at an edge; `key` seeds its noise together with the world's seed."""
@@ -125,28 +103,17 @@ class World:
         return full if r is None else full[r.top : r.top + r.height, r.left : r.left + r.width]
 
 
-class SimulatedProjector(base.Projector):
+class SimulatedProjector(virtual.VirtualProjector):
     """A DLP4500 that plays any number of 8-bit patterns."""
 
     def __init__(self, world: World, uri: str) -> None:
-        super().__init__()
-        self._world, self._loaded = world, -1
-        self._tokens = itertools.count()
         p = world.instrument.rig.projector
-        self._info = base.ProjectorInfo(uri, "simulated DLP4500", "sim", p.width, p.height, p.layout, 8333, 4096)
+        super().__init__(
+            base.ProjectorInfo(uri, "simulated DLP4500", "sim", p.width, p.height, p.layout, 8333, 4096)
+        )
+        self._world = world
 
-    @property
-    def info(self) -> base.ProjectorInfo:
-        """What it is."""
-        return self._info
-
-    def _load(self, shot: base.Shot) -> base.LoadedShot:
-        self._loaded = next(self._tokens)
-        return base.LoadedShot(shot, shot.exposure, self._loaded)
-
-    def _fire(self, loaded: base.LoadedShot) -> base.Running:
-        if loaded.token != self._loaded:
-            raise RejectedError(f"{self._info.uri}: this shot is no longer loaded; load it again")
+    def _play(self, loaded: base.LoadedShot) -> base.Running:
         return _SimulatedRunning(self._world, loaded)
 
 
@@ -169,7 +136,7 @@ class _SimulatedRunning(base.Running):
             shown = shot.patterns[k - 1] if k and k in self._world.faults.repeat else p
             at = self._world.advance(period)
             self._edges.append(at)
-            self._world.raise_edge(
+            self._world.line.rise(
                 _Edge(k, at, period, shown.image, leds, self._loaded.exposure.duration_us, self._world.ring)
             )
 
@@ -191,12 +158,10 @@ class _SimulatedRunning(base.Running):
         return tuple(self._edges)
 
 
-class SimulatedCamera(base.Camera):
+class SimulatedCamera(virtual.VirtualCamera[_Edge]):
     """A camera that photographs the world."""
 
     def __init__(self, world: World, name: str, uri: str) -> None:
-        super().__init__()
-        self._world, self.name = world, name
         inst = world.instrument
         lens, own = inst.rig.camera(name).lens, inst.pixel_formats[inst.rig.index(name)]
         kind = "BayerRG" if own.is_bayer else "Mono"
@@ -204,146 +169,49 @@ class SimulatedCamera(base.Camera):
         info = base.CameraInfo(
             uri, "simulated IMX183", name, lens.width, lens.height, formats, base.Shutter.ROLLING, inst.readout_us
         )
-        self._info = info
-        self._settings = base.CameraSettings(own, inst.standard_exposure_us)
-        self._acquisition: _SimulatedAcquisition | None = None
-        self._block = 0
+        super().__init__(info, base.CameraSettings(own, inst.standard_exposure_us), world.line)
+        self._world = world
 
-    @property
-    def info(self) -> base.CameraInfo:
-        """What it is."""
-        return self._info
-
-    @property
-    def settings(self) -> base.CameraSettings:
-        """What it is set to."""
-        return self._settings
-
-    def _configure(self, settings: base.CameraSettings) -> base.CameraSettings:
-        self._settings = settings
-        return settings
-
-    def _arm(self, n: int, trigger: base.Trigger) -> base.Acquisition:
-        a = _SimulatedAcquisition(self, self._world, n, trigger, self._settings)
-        self._world.attach(self.name, a)
-        self._acquisition = a
-        return a
-
-    def next_block(self) -> int:
-        """Number of the exposure that begins now."""
-        with self._lock:
-            self._block += 1
-            return self._block
-
-    def _close(self) -> None:
-        if self._acquisition is not None:
-            self._acquisition.cancel()
+    def _acquire(self, n: int, trigger: base.Trigger) -> virtual.VirtualAcquisition[_Edge]:
+        return _SimulatedAcquisition(self, self._world, n, trigger)
 
 
-class _SimulatedAcquisition(base.Acquisition):
-    """Edges wait in a queue; the frame is rendered when it is taken."""
+class _SimulatedAcquisition(virtual.VirtualAcquisition[_Edge]):
+    """The frame is rendered when it is taken, with the settings at arming."""
 
-    def __init__(
-        self, camera: SimulatedCamera, world: World, n: int, trigger: base.Trigger, settings: base.CameraSettings
-    ) -> None:
-        self._camera, self._world, self._n, self._trigger, self._settings = camera, world, n, trigger, settings
-        self._queue: queue.SimpleQueue[tuple[_Edge, int, int] | None] = queue.SimpleQueue()
-        self._seen = itertools.count()
-        self._taken = 0
-        self._cancelled = threading.Event()
+    def __init__(self, camera: SimulatedCamera, world: World, n: int, trigger: base.Trigger) -> None:
+        super().__init__(camera, world.line, n, trigger)
+        self._world, self._settings = world, camera.settings
 
-    def edge(self, edge: _Edge) -> None:
-        """The line rose."""
-        f, name, k = self._world.faults, self._camera.name, next(self._seen)
-        if self._cancelled.is_set() or k in f.miss.get(name, ()):
-            return
-        self._queue.put((edge, k, self._camera.next_block()))
+    def _sees(self, number: int) -> bool:
+        return number not in self._world.faults.miss.get(self.name, ())
 
-    def trigger(self) -> None:
-        """See `base.Acquisition`."""
-        if self._trigger.source is not base.TriggerSource.SOFTWARE:
-            raise RejectedError(
-                f"{self._camera.info.uri}: armed for the line; a software trigger needs TriggerSource.SOFTWARE"
-            )
-        period = self._settings.exposure_us * 1000
-        self.edge(
-            _Edge(0, self._world.advance(period), period, None, 0.0, self._settings.exposure_us, self._world.ring)
-        )
+    def _own_edge(self) -> _Edge:
+        exposure_us = self._settings.exposure_us
+        period = exposure_us * 1000
+        return _Edge(0, self._world.advance(period), period, None, 0.0, exposure_us, self._world.ring)
 
-    def __iter__(self) -> Iterator[base.Frame]:
-        uri, f, name = self._camera.info.uri, self._world.faults, self._camera.name
-        while self._taken < self._n and not self._cancelled.is_set():
-            item = self._next(self._trigger.timeout_s)
-            if item is None:
-                return
-            edge, k, block = item
-            if f.lost.get(name) == k:
-                raise DeviceLostError(f"{uri}: the camera no longer answers; check its cable and open it again")
-            if k in f.drop.get(name, ()):
-                continue
-            self._taken += 1
-            yield self._frame(edge, k, block)
-
-    def _next(self, timeout_s: float) -> tuple[_Edge, int, int] | None:
-        try:
-            return self._queue.get(timeout=timeout_s)
-        except queue.Empty:
-            raise DeviceTimeoutError(
-                f"{self._camera.info.uri}: no frame {self._taken + 1} of {self._n} in {timeout_s} s; "
-                "is the trigger connected?"
-            ) from None
-
-    def _frame(self, edge: _Edge, k: int, block: int) -> base.Frame:
-        f, name = self._world.faults, self._camera.name
-        pixels = self._world.picture(name, edge, self._settings, block)
-        at = edge.at_ns + (edge.period_ns // 2 if k in f.late.get(name, ()) else 0)
-        complete = k not in f.corrupt.get(name, ())
+    def _frame(self, edge: _Edge, number: int, block: int) -> base.Frame | None:
+        f = self._world.faults
+        if f.lost.get(self.name) == number:
+            uri = self._camera.info.uri
+            raise DeviceLostError(f"{uri}: the camera no longer answers; check its cable and open it again")
+        if number in f.drop.get(self.name, ()):
+            return None
+        pixels = self._world.picture(self.name, edge, self._settings, block)
+        at = edge.at_ns + (edge.period_ns // 2 if number in f.late.get(self.name, ()) else 0)
+        complete = number not in f.corrupt.get(self.name, ())
         if not complete:
             pixels[pixels.shape[0] // 2 :] = 0
         chunks = {"ExposureTime": self._settings.exposure_us, "BlockId": block}
         return base.Frame(pixels, self._settings.pixel_format, block, at, time.monotonic_ns(), complete, chunks)
 
-    def surplus(self, wait_s: float) -> int:
-        """See `base.Acquisition`. Virtual time: `wait_s` need not pass."""
-        del wait_s
-        n = 0
-        while True:
-            try:
-                item = self._queue.get_nowait()
-            except queue.Empty:
-                return n
-            n += item is not None
 
-    def cancel(self) -> None:
-        """See `base.Acquisition`."""
-        if not self._cancelled.is_set():
-            self._cancelled.set()
-            self._world.detach(self._camera.name, self)
-            self._queue.put(None)
-
-
-class SimulatedLight(base.Light):
+class SimulatedLight(virtual.VirtualLight):
     """The ring light."""
 
     def __init__(self, world: World, uri: str) -> None:
-        super().__init__()
-        self._world, self._info = world, base.LightInfo(uri, "simulated ring light")
-
-    @property
-    def info(self) -> base.LightInfo:
-        """What it is."""
-        return self._info
-
-    @property
-    def level(self) -> float:
-        """Its level, 0..1."""
-        return self._world.ring
-
-    def _set(self, level: float) -> None:
-        self._world.ring = float(level)
-
-    def _close(self) -> None:
-        self._world.ring = 0.0
+        super().__init__(world, base.LightInfo(uri, "simulated ring light"))
 
 
 # ---------------------------------------------------------------------------------------------------------- by name

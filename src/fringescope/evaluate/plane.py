@@ -3,68 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fringescope.errors import EmptyResultError
-from fringescope.evaluate.statistics import (
-    BAND_MM,
-    Spread,
-    finite_points,
-    plain,
-    sample,
-    scale_of,
-    spread,
-    tile_form,
-    triple,
-    tukey,
-)
-from fringescope.types import F64, Bool
+from fringescope.evaluate.form import FormFit, across
+from fringescope.evaluate.statistics import BAND_MM, finite_points, sample, scale_of, spread, tile_form, triple, tukey
+from fringescope.types import F64
 
 
-@dataclass(frozen=True, eq=False)
-class PlaneFit:
-    """A plane: `(p - point) . normal = 0`, normal with positive z; `error_mm` (n,) signed distances of all points.
-
-    `form_um` is the low-order shape error: standard deviation of the medians of tiles of `tile_mm`, free of pixel
-    noise (None if there are too few points). `flat_mm` (n, 2) are coordinates within the plane, `own` (n,) tells the
-    points within the band.
-    """
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlaneFit(FormFit):
+    """A plane: `(p - point) . normal = 0`, normal with positive z; its own points lie within the band."""
 
     point: tuple[float, float, float]
     normal: tuple[float, float, float]
-    inliers: int
     flying_ppm: float
-    spread: Spread
-    form_um: float | None
-    tile_mm: float
-    error_mm: F64
-    flat_mm: F64
-    own: Bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Numbers only, for `--json`."""
-        return plain(self)
-
-    @property
-    def deviation_um(self) -> F64:
-        """(n,) deviation of the plane's own points, NaN elsewhere: with `flat_mm` what `report.error_map` draws."""
-        return np.where(self.own, 1e3 * self.error_mm, np.nan)
 
     def lines(self) -> tuple[tuple[str, str], ...]:
         """Name and value of the main figures, for people."""
-        s = self.spread
         form = (("form", f"{self.form_um:.2f} µm"),) if self.form_um is not None else ()
-        return (
-            ("points", f"{self.inliers:,}"),
-            ("std", f"{s.std_um:.2f} µm"),
-            ("rms", f"{s.rms_um:.2f} µm"),
-            ("p99", f"{s.p99_um:.1f} µm"),
-            *form,
-            ("flying", f"{self.flying_ppm:.0f} ppm"),
-        )
+        flying = ("flying", f"{self.flying_ppm:.0f} ppm")
+        return (("points", f"{self.inliers:,}"), *self.spread_lines(), *form, flying)
 
 
 def search_plane(p: F64, band: float, rng: np.random.Generator, tries: int = 600) -> tuple[F64, F64, float]:
@@ -129,10 +90,7 @@ def describe_plane(p: F64, point: F64, normal: F64, band: float, tile: float) ->
     near = np.abs(e) < band
     if not near.any():
         raise EmptyResultError(f"no point within {band:g} mm of the plane")
-    x = np.array([1.0, 0, 0]) if abs(normal[0]) < 0.9 else np.array([0, 1.0, 0])
-    x -= (x @ normal) * normal
-    x /= np.linalg.norm(x)
-    flat = (p - point) @ np.stack([x, np.cross(normal, x)], 1)
+    flat = (p - point) @ across(normal)
     form, side = tile_form(flat[near], e[near], tile)
     return PlaneFit(
         point=triple(point),

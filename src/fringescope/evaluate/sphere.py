@@ -5,74 +5,43 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from fringescope.errors import EmptyResultError
+from fringescope.evaluate.form import FormFit, across
 from fringescope.evaluate.plane import refine_plane, search_plane
-from fringescope.evaluate.statistics import (
-    BAND_MM,
-    Spread,
-    finite_points,
-    plain,
-    sample,
-    scale_of,
-    spread,
-    tile_form,
-    triple,
-    tukey,
-)
-from fringescope.types import F64, Bool
+from fringescope.evaluate.statistics import BAND_MM, finite_points, sample, scale_of, spread, tile_form, triple, tukey
+from fringescope.types import F64
 
 
-@dataclass(frozen=True, eq=False)
-class SphereFit:
-    """A sphere: `error_mm` (n,) signed distances (outside positive) of all points.
-
-    `own` (n,) tells its points: within the band, and not nearer to the base plane.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SphereFit(FormFit):
+    """A sphere; errors outside it are positive. Its own points lie within the band, and not nearer to the base plane.
 
     `cap_deg` is the polar angle that the inliers fill (180 = whole). With a nominal radius, `radius_error_um` is fitted
-    minus nominal and `fixed_rms_um` the rms about the best sphere of exactly that radius. `flat_mm` (n, 2) unrolls the
+    minus nominal and `fixed_rms_um` the rms about the best sphere of exactly that radius. `flat_mm` unrolls the
     sphere about the middle of the cap (equal area).
     """
 
     center: tuple[float, float, float]
     radius_mm: float
-    inliers: int
-    spread: Spread
-    form_um: float | None
-    tile_mm: float
     cap_deg: float
     nominal_radius_mm: float | None
     radius_error_um: float | None
     fixed_rms_um: float | None
-    error_mm: F64
-    flat_mm: F64
-    own: Bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Numbers only, for `--json`."""
-        return plain(self)
-
-    @property
-    def deviation_um(self) -> F64:
-        """(n,) deviation of the sphere's own points, NaN elsewhere: with `flat_mm` what `report.error_map` draws."""
-        return np.where(self.own, 1e3 * self.error_mm, np.nan)
 
     def lines(self) -> tuple[tuple[str, str], ...]:
         """Name and value of the main figures, for people."""
-        s = self.spread
         error = self.radius_error_um
+        told = (("radius error", f"{error:+.2f} µm".replace("-", "−")),) if error is not None else ()
         return (
             ("points", f"{self.inliers:,}"),
             ("radius", f"{self.radius_mm:.4f} mm"),
-            *((("radius error", f"{error:+.2f} µm".replace("-", "−")),) if error is not None else ()),
-            ("std", f"{s.std_um:.2f} µm"),
-            ("rms", f"{s.rms_um:.2f} µm"),
-            ("p99", f"{s.p99_um:.1f} µm"),
+            *told,
+            *self.spread_lines(),
         )
 
 
@@ -219,10 +188,7 @@ def _describe_sphere(
     axis = unit[near].mean(0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)
     height = np.clip(unit @ axis, -1, 1)
-    x = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
-    x -= (x @ axis) * axis
-    x /= np.linalg.norm(x)
-    flat = radius * np.sqrt(2 / np.maximum(1 + height, 1e-9))[:, None] * (unit @ np.stack([x, np.cross(axis, x)], 1))
+    flat = radius * np.sqrt(2 / np.maximum(1 + height, 1e-9))[:, None] * (unit @ across(axis))
     tile = min(3.0, radius / 3)
     form, tile = tile_form(flat[near], e[near], tile)
     named = min(nominal, key=lambda r: abs(r - radius)) if nominal else None

@@ -15,6 +15,9 @@ from fringescope.evaluate.sphere import SphereFit, fit_spheres
 from fringescope.evaluate.statistics import BAND_MM, along_rays, neighbour_correlation, plain, sigma_ratio
 from fringescope.types import F64, Bool
 
+RATIO = (0.8, 1.25)  #: robust spread of error over sigma that counts as calibrated
+ALIKE = 0.4  #: neighbours' errors more alike than this did not come from samples of their own
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -22,6 +25,7 @@ class Evaluation:
 
     `error_mm` (n,) is each point's distance to its own form (NaN for flying points). `sigma_ratio`: robust spread of
     error over sigma, 1 where the uncertainty is calibrated (None without sigmas). `center_distances_mm`: (i, j, mm).
+    `words`: what the figures mean where they are not as they should be.
     """
 
     kind: str
@@ -33,6 +37,7 @@ class Evaluation:
     center_distances_mm: tuple[tuple[int, int, float], ...]
     sigma_ratio: float | None
     neighbour_correlation: float | None
+    words: tuple[str, ...]
     error_mm: F64
 
     def to_dict(self) -> dict[str, Any]:
@@ -86,7 +91,7 @@ def evaluate(
         own = plane.own & np.isnan(error)
         error[own] = plane.error_mm[own]
         normal[own] = plane.normal
-    ratio = None
+    ratio, along = None, views is not None and centres is not None
     if sigma_mm is not None:
         e = error
         if views is not None and centres is not None:
@@ -97,10 +102,36 @@ def evaluate(
         for i, a in enumerate(spheres)
         for j, b in enumerate(spheres[i + 1 :], i + 1)
     )
+    alike = neighbour_correlation(p, error, views)
     return Evaluation(
-        fit, len(p), band_mm, 1e6 * float(np.isnan(error).mean()), plane, spheres, distances, ratio,
-        neighbour_correlation(p, error, views), error,
+        fit, len(p), band_mm, 1e6 * float(np.isnan(error).mean()), plane, spheres, distances, ratio, alike,
+        _words(ratio, along, alike), error,
     )  # fmt: skip
+
+
+def _words(ratio: float | None, along: bool, alike: float | None) -> tuple[str, ...]:
+    """What a sigma that does not fit the errors, and errors that are alike, tell."""
+    out = []
+    if ratio is not None and ratio > RATIO[1]:
+        out.append(
+            f"errors are {ratio:.2g} times what sigma says: vibration, light from surface to surface, a rig that has "
+            "drifted, or a form that is not quite this one"
+        )
+    if ratio is not None and ratio < RATIO[0]:
+        out.append(
+            f"errors are only {ratio:.2g} of what sigma says: "
+            + (
+                "something smoothed the points or their frames, or the capture's noise figures are too high"
+                if along
+                else "sigma is along the camera's ray, the error here across the form: give the rig to compare them"
+            )
+        )
+    if alike is not None and alike > ALIKE:
+        out.append(
+            f"errors of neighbours are alike (correlation {alike:.2f}): frames with interpolated pixels (demosaiced, "
+            "scaled, smoothed, JPEG), or an error that is not noise"
+        )
+    return tuple(out)
 
 
 def _base(p: F64, rest: Bool, band: float, seed: int) -> PlaneFit | None:
