@@ -1,5 +1,6 @@
 """Each mask on small drawn scenes: it must take what is bad, keep what is good, and say why."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -349,3 +350,52 @@ def test_the_verdict_of_a_black_view():
     assert v.points == 0
     assert any("no point was left" in w for w in v.words)
     assert any("lens cap" in w for w in v.words)
+
+
+# ----------------------------------------------------------------------------------------------- interpolated pixels
+
+
+def rgb_frames(change, gamma=1.0, full=255):
+    """An RGB capture whose sensor samples go through `change`, decoded."""
+    rng = np.random.default_rng(3)
+    plan = core.plan(core.fringes(450), core.fringes(60), core.fringes(16, steps=8), pixel_format=PixelFormat.RGB8)
+    u, v = core.image(shape=(120, 160))
+    frames = []
+    for key, ideal in core.draw(plan, u, v, 110.0, 70.0, (0.0, 0.0), np.random.default_rng(0)):
+        mean = np.asarray(ideal, float).reshape(*ideal.shape[:2], -1)[..., 0]
+        mean = full * (mean / 255) ** gamma
+        noisy = mean[..., None] + rng.normal(0, 2.0, (*mean.shape, 3))
+        frames.append((key, change(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))))
+    return phase.measure(frames, plan, PhaseSettings())
+
+
+def demosaiced(rgb, code):
+    raw = rgb[..., 1].copy()
+    raw[0::2, 0::2], raw[1::2, 1::2] = rgb[0::2, 0::2, 0], rgb[1::2, 1::2, 2]
+    return cv2.cvtColor(raw, code)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.3])
+def test_rgb_of_three_samples_a_pixel_is_no_interpolation(gamma):
+    assert not denoise.interpolated(rgb_frames(lambda a: a, gamma), PixelFormat.RGB8)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a: demosaiced(a, cv2.COLOR_BayerRG2RGB),
+        lambda a: demosaiced(a, cv2.COLOR_BayerRG2RGB_EA),
+        lambda a: demosaiced(a, cv2.COLOR_BayerRG2RGB_VNG),
+        lambda a: cv2.GaussianBlur(a, (3, 3), 0.7),
+        lambda a: cv2.resize(a[::2, ::2], (160, 120), interpolation=cv2.INTER_LINEAR),
+    ],
+    ids=["bilinear", "edges", "vng", "blurred", "scaled"],
+)
+@pytest.mark.parametrize("gamma", [1.0, 1.3])
+def test_interpolated_pixels_are_told(change, gamma):
+    decoded = rgb_frames(change, gamma)
+    assert denoise.interpolated(decoded, PixelFormat.RGB8)
+    assert not denoise.interpolated(decoded, PixelFormat.MONO8)
+    grid = lossy()
+    assert "interpolated" in denoise.verdict(grid, True).words[-1]
+    assert not any("interpolated" in w for w in denoise.verdict(grid).words)

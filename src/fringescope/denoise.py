@@ -17,6 +17,7 @@ from fringescope import geometry
 from fringescope.kernels import regions as k
 from fringescope.settings import DenoiseSettings
 from fringescope.types import (
+    F32,
     F64,
     U16,
     Bool,
@@ -186,8 +187,37 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings) -> tuple[Grid, ..
     return tuple(out)
 
 
-def verdict(grid: Grid) -> ViewVerdict:
-    """What a view lost and why, in figures and in words that a person can act on."""
+def interpolated(decoded: Decoded, pixel_format: PixelFormat) -> bool:
+    """Whether an RGB view's pixels were interpolated from their neighbours (demosaiced, scaled, JPEG).
+
+    Tells by the misfits of the coarsest N-step set (N > 3), which are noise: from interpolated pixels they vary less
+    between neighbours than farther apart, or differ between the two colours of a chessboard. Judged as
+    V(1) / V(3) of their second differences, and as the ratio of their mean squares.
+    """
+    if pixel_format is not PixelFormat.RGB8:
+        return False
+    for w in sorted((w for w in decoded.sets if w.steps > 3), key=lambda w: _norm(w.g)):
+        bright = np.isfinite(w.misfit) & (w.saturated == 0) & (w.modulation > 0.1 * w.background)
+        m = np.where(bright, np.minimum(w.misfit, 3.0), np.nan)
+        near, far = (_second_difference(m, k) for k in (1, 3))
+        even, odd = (np.concatenate([m[0::2, a::2].ravel(), m[1::2, 1 - a :: 2].ravel()]) for a in (0, 1))
+        squares = [float(np.sum(x[np.isfinite(x)] ** 2)) / max(np.isfinite(x).sum(), 1) for x in (even, odd)]
+        if np.isfinite(m).sum() < 1000 or not (far > 0 and min(squares) > 0):
+            continue
+        return near < 0.9 * far or abs(np.log(squares[0] / squares[1])) > 0.15
+    return False
+
+
+def _second_difference(m: F32, k: int) -> float:
+    """Mean square of m(i - k) - 2 m(i) + m(i + k) along rows and columns."""
+    along, down = m[:, 2 * k :] - 2 * m[:, k:-k] + m[:, : -2 * k], m[2 * k :] - 2 * m[k:-k] + m[: -2 * k]
+    d = np.concatenate([along.ravel(), down.ravel()])
+    d = d[np.isfinite(d)]
+    return float(np.mean(d * d)) if d.size else 0.0
+
+
+def verdict(grid: Grid, alike: bool = False) -> ViewVerdict:
+    """What a view lost and why, in figures and in words that a person can act on; `alike` is that of `interpolated`."""
     n = int(grid.reasons.size)
     lost = {r.name.lower(): int(((grid.reasons & r) != 0).sum()) for r in Reason if r.name}
     points = int((grid.reasons == 0).sum())
@@ -202,6 +232,11 @@ def verdict(grid: Grid) -> ViewVerdict:
         part = float(hit.sum()) / n if weak else float((hit & ~without).sum()) / max(lit, 1)
         if part > share:
             words.append(f"{grid.camera}: {100 * part:.1f} % {reason.label}: {advice}")
+    if alike:
+        words.append(
+            f"{grid.camera}: its pixels were interpolated from their neighbours, whose errors are thus alike: sigma is "
+            "too small for whatever averages them; record raw Bayer frames"
+        )
     return ViewVerdict(grid.camera, n, points, lost, tuple(words))
 
 

@@ -22,6 +22,7 @@ from fringescope.types import (
     Board,
     Calibration,
     Decoded,
+    Direction,
     Evidence,
     FrameKey,
     Grid,
@@ -55,6 +56,13 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
 
     Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do.
     """
+    decoded = clean_view(view, rig, s)
+    grid = triangulate.grid(decoded, decoded.reasons, rig, volume_margin=s.denoise.volume_margin)  # equations 8 to 15
+    return phase.with_reasons(decoded, grid.reasons), grid
+
+
+def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
+    """One camera's frames to absolute phase, with the reasons of all masks (Fig. 7). Raises as `scan_view`."""
     geometry.check_baseline(rig, rig.camera(view.plan.camera))
     decoded = phase.measure(view.frames, view.plan, s.phase, view.noise)  # II-C; frames may still be arriving
     decoded = phase.settle_order(decoded, view.plan, s.phase, rig, s.denoise.volume_margin)
@@ -62,8 +70,7 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
     reasons = denoise.monotonic(decoded, reasons, rig, s.denoise)  # III-D 2
     reasons = denoise.connected(decoded, reasons, rig, s.denoise)  # III-D 3
     reasons = denoise.local(decoded, reasons, rig, s.denoise)
-    grid = triangulate.grid(decoded, reasons, rig, volume_margin=s.denoise.volume_margin)  # equations 8 to 15
-    return phase.with_reasons(decoded, grid.reasons), grid
+    return phase.with_reasons(decoded, reasons)
 
 
 BAND = 4_000_000  #: pixels of a board picture that are decoded at a time
@@ -164,12 +171,15 @@ def verify(
     tell = progress or _silent
     grids: list[Grid] = []
     sightings: list[Sighting] = []
+    crossed: list[evaluate.EpipolarResidual] = []
     doubts: list[str] = []
     for n, view in enumerate(views):
         tell(f"decoding {view.plan.camera}", n / (len(views) + 1))
         frames = list(view.frames)
-        decoded, grid = scan_view(replace(view, frames=frames), rig, s)
+        decoded = clean_view(replace(view, frames=frames), rig, s)
+        grid, others = _deepest(decoded, rig, s)
         grids.append(grid)
+        crossed += [e for d in others if (e := evaluate.epipolar_residual(grid, decoded, d, rig)) is not None]
         if board is not None:
             try:
                 mean = phase.mean_picture(frames, view.plan)
@@ -191,7 +201,22 @@ def verify(
         radius_um = 1e3 * (evaluate.fit_sphere(points, sphere_mm).radius_mm - sphere_mm)
     if not sightings:  # an ordinary specimen shows no board; that is no doubt
         doubts = []
-    return evaluate.judge(rig, evaluate.agreement(grids, rig), s.verify, trueness, radius_um, tuple(doubts))
+    blind = tuple(g.camera for g in grids if not g.valid.any())
+    views_agree = evaluate.agreement(grids, rig)
+    return evaluate.judge(rig, views_agree, s.verify, trueness, radius_um, tuple(crossed), blind, tuple(doubts))
+
+
+def _deepest(decoded: Decoded, rig: Rig, s: Settings) -> tuple[Grid, list[Direction]]:
+    """The points by the direction that tells depth best, and the other directions."""
+    best: tuple[float, Grid, int] | None = None
+    for i, d in enumerate(decoded.directions):
+        one = replace(decoded, directions=(d,))
+        grid = triangulate.grid(one, decoded.reasons, rig, volume_margin=s.denoise.volume_margin)
+        sigma = float(np.median(grid.sigma[grid.valid])) if grid.valid.any() else np.inf
+        if best is None or sigma < best[0]:
+            best = (sigma, grid, i)
+    assert best is not None  # settle_order gives one direction at least
+    return best[1], [d for i, d in enumerate(decoded.directions) if i != best[2]]
 
 
 def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:
@@ -231,12 +256,13 @@ def scan(
         photos.append(picture(view, decoded, s))
         times[f"scan_view {grid.camera}"] = perf_counter() - start
         figures["views"][grid.camera] = _figures(decoded, grid)
+        figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
     order = np.argsort([g.view for g in grids])
     grids, photos = [grids[i] for i in order], [photos[i] for i in order]
     tell("comparing the views", 0.7)
     start = perf_counter()
     grids = list(denoise.agree(grids, rig, s.denoise))
-    verdicts = tuple(denoise.verdict(g) for g in grids)
+    verdicts = tuple(denoise.verdict(g, figures["views"][g.camera]["interpolated"]) for g in grids)
     if not any(v.points for v in verdicts):
         raise EmptyResultError("no point was left; " + "; ".join(w for v in verdicts for w in v.words[1:]))
     times["agree"] = perf_counter() - start
