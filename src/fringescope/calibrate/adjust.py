@@ -226,7 +226,7 @@ def polish(problem: Problem, state: State, noise: Noise, s: CalibrateSettings, t
 
 
 def components(problem: Problem, state: State, weights: Weights, noise: Noise) -> Noise:
-    """Variance components (Foerstner 1979): a camera's and kind's sum of squares over its redundancy; design effects."""
+    """Variance components (Foerstner 1979): sums of squares over redundancies, per camera and kind; design effects."""
     H, _ = folded(problem, normal(problem, state, weights))
     inverse, _ = inverse_normal(H)
     S = problem.free

@@ -48,6 +48,7 @@ UNITS = {
     **dict.fromkeys(LENS[:4], "px"), **dict.fromkeys(LENS[4:], ""), **dict.fromkeys(POSE[:3], "rad"),
     **dict.fromkeys(POSE[3:], "mm"),
 }  # fmt: skip
+MAP_POINTS = 400  #: samples around a corner that its projector coordinate is read from
 GROWN = 1.1  #: the measuring volume over what the boards filled
 
 
@@ -280,6 +281,7 @@ def read_at_corners(
     out, sigma = np.full((len(s.corner), 2), np.nan), np.full((len(s.corner), 2), np.nan)
     for i, c in enumerate(s.corner_px):
         near = np.flatnonzero(np.abs(px - c).max(axis=1) < 1.6 * side)
+        near = near[:: max(1, len(near) // MAP_POINTS)]
         fitted = _local(px[near] - c, uv[near]) if len(near) >= 16 else None
         if fitted is not None:
             out[i], sigma[i] = fitted
@@ -303,7 +305,7 @@ def _local(d: F64, uv: F64) -> tuple[F64, F64] | None:
     x, y = (d / scale).T
     A = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     keep = np.ones(len(x), dtype=bool)
-    for _ in range(3):
+    for _ in range(2):
         N = A[keep].T @ A[keep]
         if keep.sum() < 10 or np.linalg.cond(N) > 1e8:
             return None

@@ -237,8 +237,10 @@ class Normal:
 def block_normal(problem: Problem, state: State, b: Block, w: F64) -> tuple[I32, F64, F64, float]:
     """One block's share of the normal equations: columns, H, g, cost."""
     e = evaluate(problem, state, b)
-    used = w > 0
-    r, J, weight = e.residual[used], e.J[used] if len(e.J) else np.zeros((0, len(e.columns))), w[used]
+    r, J, weight = e.residual.ravel(), e.J.reshape(-1, len(e.columns)), w.ravel()
+    used = np.flatnonzero(weight > 0)
+    if len(used) < len(r):
+        r, J, weight = r[used], J[used], weight[used]
     Jw = J * weight[:, None]
     return e.columns, Jw.T @ J, Jw.T @ r, float(np.sum(weight * r * r))
 

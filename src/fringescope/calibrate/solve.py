@@ -377,9 +377,11 @@ def _miss(
 
 def _final(problem: Problem, state: State, models: tuple[str, ...], s: CalibrateSettings) -> Fit:
     coarse, state = replace_models(thinned(problem, CHOOSING), state, models, s)
-    state, _ = settle(coarse, state, 2, s.rounds)
-    full, state = replace_models(problem, state, models, s)
-    return polish(full, state, robust_noise(full, residuals(full, state)), s)
+    state, noise = settle(coarse, state, 2, s.rounds)
+    first = polish(coarse, state, noise, s, turns=3)
+    full, state = replace_models(problem, first.state, models, s)
+    fit = polish(full, state, robust_noise(full, residuals(full, state)), s, turns=2)
+    return replace(fit, steps=first.steps + fit.steps)
 
 
 def _late(
