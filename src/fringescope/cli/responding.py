@@ -105,8 +105,9 @@ def _settled(view: ViewInput, s: Settings) -> Decoded:
 
 
 def _of_view(
-    view: ViewInput, exponents: tuple[float, ...], levels: tuple[float, float], s: Settings
+    view: ViewInput, exponents: tuple[float, ...], levels: tuple[float, float], s: Settings, draw: bool
 ) -> tuple[Response, list[RippleCurve]]:
+    """A view's response; with `draw` also the ripples of its directions before and after."""
     from fringescope import phase, response
 
     decoded = _settled(view, s)
@@ -115,9 +116,9 @@ def _of_view(
         each = exponents * (count // len(exponents)) if count % len(exponents) == 0 else exponents
         return response.from_exponents(decoded, each, s.response, levels), []
     found = response.from_fringes(decoded, view.frames, view.plan, s.response, levels)
-    mended = response.corrected(replace(decoded, directions=()), replace(found, needed=True))
-    if not decoded.directions:
+    if not (draw and decoded.directions):
         return found, []
+    mended = response.corrected(replace(decoded, directions=()), replace(found, needed=True))
     after = phase.settle_order(mended, view.plan, s.phase)
     return found, _plane_ripples(decoded, after)
 
@@ -211,7 +212,7 @@ def response(
         raise UsageError(f"--drawn {drawn:g}; needed a power of 0.05 to 20")
     if staircase is not None and exponents is not None:
         raise UsageError("--staircase and --exponents: needed one of them")
-    fmt = pixel_format(pixel_format_)
+    fmt, drawn_levels = pixel_format(pixel_format_), (span[0] / 255, span[1] / 255)
     curves: list[RippleCurve] = []
     with Progress() as progress:
         if staircase is not None:
@@ -229,7 +230,7 @@ def response(
             failed: list[str] = []
             for v in progress.track(views, "measuring", len(views)):
                 try:
-                    every[v.plan.camera], more = _of_view(v, powers, (span[0] / 255, span[1] / 255), s)
+                    every[v.plan.camera], more = _of_view(v, powers, drawn_levels, s, report is not None)
                 except EmptyResultError as e:
                     failed.append(str(e))
                     continue

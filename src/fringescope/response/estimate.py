@@ -28,7 +28,7 @@ from fringescope.types import F64, Bool
 ORDERS = 11  #: harmonics h_2 .. h_12 that the equations hold
 ROUNDS = 20
 LIKE = 0.5  #: periods nearer than this ratio keep their orders under any response
-GRID = 2048  #: entries of a table over one ripple
+GRID = 1024  #: entries of a table over one ripple
 CONVERGED = 3e-5  #: change of a harmonic
 EFFECT = 30.0  #: by how much alike neighbouring pixels are at first taken to be
 TUKEY = 4.685  #: residuals beyond this many robust deviations have no say
@@ -116,7 +116,7 @@ class _Ripple:
         log, by = np.log(1 + x), self.dh[used].T @ (by_h / (1 + x))
         self._rows = np.concatenate([[1 + np.imag(slope / (1 + x))], [log.real], [log.imag], by.real, by.imag])
 
-        self._add, _ = model.table(self.h, o.steps, GRID // 2)
+        self._add, _ = model.table(self.h, o.steps, GRID)
 
     def true(self, measured: F64) -> F64:
         """Measured phases (any number of turns) to true ones."""

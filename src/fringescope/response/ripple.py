@@ -12,7 +12,7 @@ from fringescope.types import F64, Decoded
 
 DEGREE = 5  #: of the polynomial that a plane's phase is, behind two lenses
 BINS = 48
-SAMPLES = 60_000
+SAMPLES = 15_000
 ROUNDS = 8  #: of fitting and leaving out what lies far off
 
 
