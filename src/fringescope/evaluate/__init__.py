@@ -8,6 +8,7 @@ figure of the form contains it.
 from fringescope.evaluate.agreement import Agreement, PairAgreement, agreement
 from fringescope.evaluate.board import BoardTrueness, board_trueness, corners_in_space
 from fringescope.evaluate.drift import Verdict, judge
+from fringescope.evaluate.epipolar import EpipolarResidual, epipolar_residual
 from fringescope.evaluate.plane import PlaneFit, fit_plane, measure_plane
 from fringescope.evaluate.repeat import Repeatability, repeatability
 from fringescope.evaluate.sphere import SphereFit, fit_sphere, fit_spheres
@@ -26,6 +27,7 @@ __all__ = [
     "BAND_MM",
     "Agreement",
     "BoardTrueness",
+    "EpipolarResidual",
     "Evaluation",
     "PairAgreement",
     "PlaneFit",
@@ -37,6 +39,7 @@ __all__ = [
     "along_rays",
     "board_trueness",
     "corners_in_space",
+    "epipolar_residual",
     "evaluate",
     "fit_plane",
     "fit_sphere",

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fringescope import geometry
 from fringescope.evaluate.statistics import plain
@@ -31,7 +32,7 @@ class PairAgreement:
     points: int
     median_um: float  #: of absolute distances
     shift_um: float  #: median of signed distances, positive where the first camera's surface is nearer to it
-    systematic_um: float  #: rms over tiles of the field of each tile's signed median
+    systematic_um: float  #: see `systematic_part`
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,7 @@ def agreement(grids: Sequence[Grid], rig: Rig, window: int = WINDOW) -> Agreemen
         if found is None:
             continue
         (rows, columns), d = found
-        h, w = a.reasons.shape
-        tile = rows * TILES[0] // h * TILES[1] + columns * TILES[1] // w
-        medians = np.array([np.median(d[tile == t]) for t in np.unique(tile) if (tile == t).sum() >= LEAST])
-        systematic = float(np.sqrt(np.mean(medians**2))) if len(medians) else float(abs(np.median(d)))
+        systematic = systematic_part(rows, columns, d, a.reasons.shape)
         pairs.append(
             PairAgreement(
                 (a.camera, b.camera), len(d), 1e3 * float(np.median(np.abs(d))), 1e3 * float(np.median(d)),
@@ -72,6 +70,13 @@ def agreement(grids: Sequence[Grid], rig: Rig, window: int = WINDOW) -> Agreemen
     n = np.array([p.points for p in pairs], dtype=float)
     systematic_um = float(np.sqrt(np.average([p.systematic_um**2 for p in pairs], weights=n)))
     return Agreement(1e3 * float(np.median(np.abs(np.concatenate(every)))), systematic_um, tuple(pairs))
+
+
+def systematic_part(rows: NDArray[np.intp], columns: NDArray[np.intp], error: F64, shape: tuple[int, ...]) -> float:
+    """Median over tiles of a picture of `shape` of the size of each tile's signed median: what noise cannot make."""
+    tile = rows * TILES[0] // shape[0] * TILES[1] + columns * TILES[1] // shape[1]
+    medians = [np.median(error[tile == t]) for t in np.unique(tile) if (tile == t).sum() >= LEAST]
+    return float(np.median(np.abs(medians or np.median(error))))
 
 
 def _averaged(grid: Grid, rig: Rig, window: int) -> F64:

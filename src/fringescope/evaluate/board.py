@@ -133,7 +133,8 @@ def _numbered(places: F64, index: I32, at: dict[tuple[int, int], list[F64]], boa
     number = np.array(list(at), dtype=np.int32)
     ok = np.isfinite(places[:, 0])
     distance, nearest = cKDTree(known).query(places[ok])
-    near = distance < board.square_mm / 3
+    near = np.asarray(distance < board.square_mm / 3)
+    nearest = np.asarray(nearest)
     if not near.any():
         return index
     best, votes = index, -1

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 from fringescope import geometry
 from fringescope.evaluate.agreement import Agreement
 from fringescope.evaluate.board import BoardTrueness
+from fringescope.evaluate.epipolar import EpipolarResidual
 from fringescope.evaluate.statistics import plain
 from fringescope.settings import VerifySettings
 from fringescope.types import Rig
@@ -23,10 +25,12 @@ class Verdict:
     scale_error_ppm: float | None
     inter_view_median_um: float | None
     inter_view_systematic_um: float | None
+    epipolar_systematic_um: float | None  #: the largest of the views
     sphere_radius_error_um: float | None
     limit_um: float
     board: BoardTrueness | None
     agreement: Agreement
+    epipolar: tuple[EpipolarResidual, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -39,16 +43,19 @@ def judge(
     s: VerifySettings,
     board: BoardTrueness | None = None,
     sphere_radius_error_um: float | None = None,
+    epipolar: tuple[EpipolarResidual, ...] = (),
+    blind: tuple[str, ...] = (),
     doubts: tuple[str, ...] = (),
 ) -> Verdict:
     """The verdict, by limits that grow with the working distance: 20 um at 500 mm with the default 4e-5.
 
-    `doubts` are things that could not be measured, in words. A verdict needs something that can fail: another view, a
-    board or a sphere; else it is "unknown".
+    A rig that was worse than that from the first day is held to what its own calibration promised (`promised_um`).
+    `blind` are cameras without a point, `doubts` other things that could not be measured, in words. A verdict needs
+    something that can fail: another view, a second fringe direction, a board or a sphere; else it is "unknown".
     """
     target = geometry.working_point(rig) if rig.volume is None else rig.volume.center
     far = max(float(((geometry.centre(c.pose) - target) ** 2).sum() ** 0.5) for c in rig.cameras)
-    limit = 1e3 * s.limit * far
+    limit = max(1e3 * s.limit * far, promised_um(rig))
     bad: list[str] = []
     good: list[str] = []
 
@@ -59,6 +66,8 @@ def judge(
     anew = "a device has moved or the rig is of another set-up; calibrate anew"
     if views.systematic_um is not None:
         weigh(views.systematic_um, limit, "the views' surfaces differ systematically by", "um", anew)
+    for e in epipolar:
+        weigh(e.systematic_um, limit, f"light that {e.camera} sees misses its place by", "um", anew)
     if board is not None:
         most = s.limit_scale_ppm + 3 * board.scale_sigma_ppm
         weigh(board.scale_error_ppm, most, "the board is measured too large by", "ppm",
@@ -68,7 +77,9 @@ def judge(
         weigh(sphere_radius_error_um, limit, "the sphere's radius is off by", "um", anew)
     if not bad and not good:
         doubts = (*doubts, "nothing to compare: one view, no board, no sphere; capture the board, or use two cameras")
-    verdict = "drifted" if bad else "ok" if good else "unknown"
+    if blind:
+        doubts = (*doubts, f"no surface came of {', '.join(blind)}: too dark, or the rig is far off")
+    verdict = "drifted" if bad else "ok" if good and not blind else "unknown"
     return Verdict(
         verdict,
         (*bad, *good, *doubts),
@@ -76,8 +87,19 @@ def judge(
         None if board is None else board.scale_error_ppm,
         views.median_um,
         views.systematic_um,
+        max((e.systematic_um for e in epipolar), default=None),
         sphere_radius_error_um,
         limit,
         board,
         views,
+        epipolar,
     )
+
+
+def promised_um(rig: Rig) -> float:
+    """How well the calibration measured boards that it did not use (rms of the poses, um), if the rig's file tells."""
+    carried = rig.extra.get("calibration")
+    poses = carried.get("held_out") if isinstance(carried, dict) else None
+    values = [p.get("corner_mm_rms") for p in poses if isinstance(p, dict)] if isinstance(poses, list) else []
+    finite = [v for v in values if isinstance(v, (int, float)) and math.isfinite(v)]
+    return 1e3 * math.sqrt(sum(v * v for v in finite) / len(finite)) if finite else 0.0
