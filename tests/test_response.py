@@ -163,7 +163,9 @@ def test_fringes_drawn_to_the_inverse_power_are_straight() -> None:
 # ------------------------------------------------------------------------------------------------- from the own fringes
 
 
-@pytest.mark.parametrize("gamma", [0.75, 1.6, 2.4])
+@pytest.mark.parametrize(
+    "gamma", [pytest.param(0.75, marks=pytest.mark.verify), 1.6, pytest.param(2.4, marks=pytest.mark.verify)]
+)
 def test_three_step_sets_that_must_agree_tell_the_response(gamma: float) -> None:
     view = draw(THREE, power(gamma))
     r = response.from_sets(decoded(view), SMALL)
@@ -337,7 +339,7 @@ def ripple_um(d: Decoded, grid: Grid) -> float:
     return float(np.hypot(c[3], c[4]))
 
 
-@pytest.mark.parametrize("preset", ["single", "pair"])  # 12 bits mono, 8 bits Bayer
+@pytest.mark.parametrize("preset", ["single", pytest.param("pair", marks=pytest.mark.verify)])  # 12 bits mono, 8 bits Bayer
 def test_the_twins_ripple_goes(preset: str) -> None:
     view, rig = twin_view(1.6, (3, 3), preset)
     d, grid = scanned(view, rig, None)
@@ -410,6 +412,7 @@ def test_the_mugs_two_frequencies_agree_after_a_correction_learnt_from_themselve
     assert disagreement(decoded(view, r)) <= 0.6
 
 
+@pytest.mark.verify
 def test_the_mugs_plane_tells_the_authors_exponent(shared: Path) -> None:
     recipe = Recipe((3, 3), (240, 240), ((1.0, 0.0), (0.0, 1.0)), (1920, 1080), Layout.GRID, step_order=(1, 0, 2))
     folder = shared / "data" / "gamma-mug"
