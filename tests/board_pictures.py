@@ -1,4 +1,4 @@
-"""Pictures of boards made without the package: pinhole and OpenCV's lens, exact edges by sampling, phases by projection."""
+"""Pictures of boards made without the package: OpenCV's lens, exact edges by sampling, phases by projection."""
 
 from __future__ import annotations
 
@@ -146,9 +146,8 @@ def take(scene: Scene) -> Picture:
 def mirrored(d: Decoded) -> Decoded:
     """A decoded view with its columns reversed."""
     turn = tuple(Direction(x.g, x.phase[:, ::-1], x.sigma[:, ::-1], x.order_margin[:, ::-1]) for x in d.directions)
-    return replace(
-        d, directions=turn, background=d.background[:, ::-1], modulation=d.modulation[:, ::-1], reasons=d.reasons[:, ::-1]
-    )
+    flipped = {name: getattr(d, name)[:, ::-1] for name in ("background", "modulation", "reasons")}
+    return replace(d, directions=turn, **flipped)
 
 
 def undistorted(device: Device, px: Array) -> Array:

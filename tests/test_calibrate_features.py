@@ -127,13 +127,13 @@ def test_fitted_corners_are_those_of_a_slow_fit_and_of_the_truth() -> None:
     assert np.isnan(out).all(), "a window that leaves the picture has no corner"
 
 
-# ----------------------------------------------------------------------------------------------------------- one picture
+# --------------------------------------------------------------------------------------------------------- one picture
 
 WAYS: dict[str, tuple[dict[str, Any], float]] = {
     "plain": ({}, 0.004),
     "mosaic": ({"gains": (0.5, 1, 1, 0.7)}, 0.004),
     "mosaic under light without red": ({"gains": (0.02, 1, 1, 0.9)}, 0.006),
-    "wide lens": ({"focal": 520, "camera_at": (10, 5, -90), "distortion": (-0.3, 0.1, 0, 0, 0)}, 0.005),
+    "wide lens": ({"focal": 520, "camera_at": (10, 5, -90), "distortion": (-0.3, 0.1, 0, 0, 0)}, 0.006),
     "tilted by 60 degrees": ({"tilt": (1.0, 0.3, 0.2)}, 0.012),
     "grey squares": ({"dark": 0.6, "noise": 0.5}, 0.006),
     "noisy": ({"noise": 8.0}, 0.03),
@@ -212,9 +212,9 @@ def test_a_board_that_leaves_the_picture_is_numbered_by_the_ends_in_view() -> No
 def test_saturated_squares_are_left_out_and_said() -> None:
     p = take(Scene())
     glare = np.zeros(p.image.shape, bool)
-    x, y = p.camera.project(p.world(np.array([(3.5, 2.5)]) + [0, 1]))[0].astype(int)
+    x, y = p.camera.project(p.world(np.array([(3.5, 2.5)])))[0].astype(int)
     glare[y - 12 : y + 13, x - 12 : x + 13] = True
-    s = seen(dirty(p, glare, 255, Reason.SATURATED), board(Scene()))
+    s = seen(dirty(p, glare, p.image[glare], Reason.SATURATED), board(Scene()))
     assert any("saturated" in w for w in s.words)
     px = s.sample_px.astype(int)
     assert not glare[px[:, 1], px[:, 0]].any()
@@ -287,7 +287,7 @@ def test_rows_and_columns_swapped_is_the_same_plain_board() -> None:
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"blur": 8.0}, "blurred: edges .* px wide"), ({"mirrored": True}, "mirrored"), ({"light": 0.0}, "no board found")],
+    [({"blur": 8.0}, "blurred: edges .* px"), ({"mirrored": True}, "mirrored"), ({"light": 0.0}, "no board found")],
 )
 def test_pictures_that_cannot_be_used(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(CalibrationError, match=f"pose00/camera1: .*{message}") as e:
@@ -324,7 +324,7 @@ def test_markers_before_opencv_4_6() -> None:
 
 def test_markers_that_do_not_fit() -> None:
     p = take(CHARUCO)
-    with pytest.raises(CalibrationError, match="markers are of DICT_4X4_50, board.json says DICT_5X5_100"):
+    with pytest.raises(CalibrationError, match=r"markers are of DICT_4X4_50, board\.json says DICT_5X5_100"):
         seen(p, board(CHARUCO, 4.4, "DICT_5X5_100"))
     with pytest.raises(CalibrationError, match="markers contradict each other"):
         seen(p, Board((7, 10), 6.0, 4.4, "DICT_4X4_100"))
@@ -369,7 +369,7 @@ def test_pictures_of_another_pose_do_not_agree() -> None:
     assert any("numbering does not agree" in w for s in kept for w in s.words)
 
 
-# ------------------------------------------------------------------------------------------------------ rendered and real
+# ---------------------------------------------------------------------------------------------------- rendered and real
 
 
 def decode(view: ViewInput) -> tuple[Decoded, np.ndarray[Any, Any]]:

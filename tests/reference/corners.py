@@ -40,7 +40,7 @@ def ring_test(image: Array, x: float, y: float, radius: float) -> tuple[float, f
 
 
 def fit_corner(image: Array, start: Array, step1: Array, step2: Array, reach: float, fine: int = 5) -> Array:
-    """Place (2,) of a chequer corner: the whole picture of two crossing edges, pixels averaged by adding up, by SciPy."""
+    """Place (2,) of a chequer corner: two crossing edges, each pixel averaged by adding up, by SciPy."""
     A = np.linalg.inv(np.column_stack([step1, step2]))
     j, i = np.meshgrid(np.arange(image.shape[1]), np.arange(image.shape[0]))
     p = np.column_stack([j.ravel(), i.ravel()]).astype(float)

@@ -82,7 +82,7 @@ def number(found: Corners, image: F32, board: Board, name: str) -> tuple[Turn, t
             )
     chosen = black_first or fitting
     best = min(chosen, key=lambda t: _untidiness(t, found, board))
-    if len(chosen) <= 2:
+    if len(chosen) <= 2 or len(possible) <= 4:  # all of it is in view: turns that change nothing
         return best, ()
     of = f"{board.inner_corners[0]} x {board.inner_corners[1]}"
     return best, (f"{extent[0]} x {extent[1]} of {of} inner corners are in view: {len(chosen)} {OPEN}",)
@@ -216,6 +216,8 @@ def agree(sightings: Sequence[Sighting], board: Board) -> tuple[Sighting, ...]:
         out[n], fits = _renumber(sightings[n], other, index, uv, first.camera, board)
         if fits:
             index, uv = np.concatenate([index, out[n].corner]), np.concatenate([uv, other])
+    if len(index) > len(first.corner):
+        out[order[0]] = replace(first, words=tuple(w for w in first.words if OPEN not in w))
     return tuple(out[n] for n in range(len(sightings)))
 
 
