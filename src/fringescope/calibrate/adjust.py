@@ -41,6 +41,7 @@ MODELS: dict[str, tuple[int, ...]] = {
 }
 USUAL = "k1 k2 p1 p2"
 NORMAL_MAD = 1.4826  #: standard deviation of a normal distribution over its median absolute value
+FINEST = 1e-4  #: pixels or projector-plane units: no measurement is called better
 TOLERANCE = 1e-9  #: share of the cost that a step must gain for another one
 
 Key = tuple[int, str]
@@ -175,7 +176,16 @@ def robust_noise(problem: Problem, found: list[F64]) -> Noise:
     for b, r in zip(problem.blocks, found, strict=True):
         values.setdefault(b.key, []).append(np.abs(r / b.sigma)[np.isfinite(r)])
     every = {k: np.concatenate(v) for k, v in values.items()}
-    return Noise({k: max(NORMAL_MAD * float(np.median(v)), 1e-9) if len(v) else 1.0 for k, v in every.items()})
+    factor = {k: NORMAL_MAD * float(np.median(v)) if len(v) else 1.0 for k, v in every.items()}
+    return Noise(floored(problem, factor))
+
+
+def floored(problem: Problem, factor: Mapping[Key, float]) -> dict[Key, float]:
+    """Factors that call no measurement better than FINEST: or one kind that fits by luck would take over the solve."""
+    sigma: dict[Key, list[F64]] = {}
+    for b in problem.blocks:
+        sigma.setdefault(b.key, []).append(b.sigma.ravel())
+    return {k: max(f, FINEST / float(np.median(np.concatenate(sigma[k])))) for k, f in factor.items()}
 
 
 def soft_weights(problem: Problem, found: list[F64], noise: Noise) -> list[F64]:
@@ -239,7 +249,7 @@ def components(problem: Problem, state: State, weights: Weights, noise: Noise) -
         squares[b.key] = squares.get(b.key, 0.0) + c * noise.effect.get(b.key, 1.0)
         count[b.key] = count.get(b.key, 0.0) + float((w > 0).sum()) - taken * noise.effect.get(b.key, 1.0)
     ratio = {k: float(np.sqrt(squares[k] / count[k])) if count[k] > 1 else 1.0 for k in squares}
-    factor = {k: max(noise.factor[k] * r, 1e-9) for k, r in ratio.items()}
+    factor = floored(problem, {k: noise.factor[k] * r for k, r in ratio.items()})
     again = Noise(factor, noise.effect, noise.own)
     return Noise(factor, design_effects(problem, state, weights, again), noise.own)
 
@@ -332,10 +342,7 @@ def chosen_models(
     Device by device, the others as they stand, twice over; see `simplest`. Models named in the settings stand.
     """
     devices = problem.sizes.devices
-    asked = [s.projector_lens, *[s.lens] * (len(devices) - 1)]
-    for name in asked:
-        if name != "auto" and name not in MODELS:
-            raise UsageError(f"setting lens: '{name}'; needed auto or one of: {', '.join(MODELS)}")
+    asked = asked_models(len(devices), s)
     models = tuple(USUAL if name == "auto" else name for name in asked)
     told: dict[str, dict[str, float]] = {}
     tried: dict[tuple[str, ...], F64] = {}
@@ -366,6 +373,15 @@ def replace_models(
         for k in set(range(5)) - set(MODELS[m]):
             lens[d, 4 + k] = 0.0
     return released(problem, models, s), replace(state, lens=lens)
+
+
+def asked_models(devices: int, s: CalibrateSettings) -> tuple[str, ...]:
+    """The lens model that the settings ask for, per device; raises UsageError for a name that there is not."""
+    asked = (s.projector_lens, *[s.lens] * (devices - 1))
+    for name in asked:
+        if name != "auto" and name not in MODELS:
+            raise UsageError(f"setting lens: '{name}'; needed auto or one of: {', '.join(MODELS)}")
+    return asked
 
 
 def simplest(scores: Mapping[str, F64], gain: float, confidence: float) -> str:

@@ -14,6 +14,7 @@ from fringescope.calibrate.adjust import (
     USUAL,
     Fit,
     Noise,
+    asked_models,
     chosen_models,
     hard_weights,
     known,
@@ -56,6 +57,7 @@ def solve(sightings: Sequence[Sighting], board: Board, sizes: Sizes, s: Calibrat
     poses, UsageError for settings that cannot mean anything.
     """
     s = s or CalibrateSettings()
+    asked_models(0, s)
     used, left = _able(sightings, sizes)
     problem = make_problem(used, board, sizes, s)
     _enough(problem, s, left)
@@ -198,7 +200,7 @@ def _agreeing(
         part = restricted(coarse, trusted)
         if turn == 0:
             state, _ = settle(released(part, ("none",) * devices, s, centres=False), state, 3, 12)
-        models = tuple(USUAL if n == "auto" else n for n in _asked(s, devices))
+        models = tuple(USUAL if n == "auto" else n for n in asked_models(devices, s))
         problem, state = replace_models(part, state, models, s)
         state, noise = settle(problem, state, 5 if turn == 0 else 3, 25)
         judged = [judge(coarse, state, noise, n, start.readings.get(n, ())) for n in range(len(used))]
@@ -207,10 +209,6 @@ def _agreeing(
             break
         trusted = keep
     return state, trusted, out
-
-
-def _asked(s: CalibrateSettings, devices: int) -> list[str]:
-    return [s.projector_lens, *[s.lens] * (devices - 1)]
 
 
 @dataclass(frozen=True, eq=False)
