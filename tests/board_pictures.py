@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -86,7 +87,6 @@ class Scene:
     camera: str = "camera1"
     fmt: PixelFormat = PixelFormat.MONO8
     seed: int = 1
-    extra: dict[str, Any] = field(default_factory=dict)
 
     def but(self, **changes: Any) -> Scene:
         """The same with changes."""
@@ -155,7 +155,7 @@ def undistorted(device: Device, px: Array) -> Array:
     n = (px - device.K[:2, 2]) / device.K[[0, 1], [0, 1]]
     k1, k2, p1, p2, k3 = device.distortion
     q = n.copy()
-    for _ in range(60):
+    for _ in range(25):
         x, y = q.T
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -165,15 +165,24 @@ def undistorted(device: Device, px: Array) -> Array:
 
 
 def _white(scene: Scene, flat: Array, fine: int = 8) -> Array:
-    """Share of white in each pixel: exact colours at fine x fine places of it."""
+    """Share of white in each pixel: exact colours at fine x fine places of those that an edge may cross."""
     dx, dy = np.gradient(flat, axis=1), np.gradient(flat, axis=0)
-    total = np.zeros(flat.shape[:2])
+    middle = _colour(scene, flat)
+    near = np.ones((3, 3))
+    edge = cv2.dilate(middle, near) != cv2.erode(middle, near)
+    total = np.zeros(int(edge.sum()))
     at = (np.arange(fine) + 0.5) / fine - 0.5
     skew = (np.arange(fine) - (fine - 1) / 2) / fine**2  # no two samples in one column or row
     for i, a in enumerate(at):
         for j, b in enumerate(at):
-            total += _colour(scene, flat + dx * (a + skew[j]) + dy * (b + skew[i]))
-    return np.asarray(total / fine**2)
+            total += _colour(scene, flat[edge] + dx[edge] * (a + skew[j]) + dy[edge] * (b + skew[i]))
+    middle[edge] = total / fine**2
+    return middle
+
+
+@cache
+def _printed(markers: Any, width: int, height: int) -> Array:
+    return np.asarray(markers.generateImage((width, height), marginSize=0))
 
 
 def _colour(scene: Scene, p: Array) -> Array:
@@ -183,7 +192,7 @@ def _colour(scene: Scene, p: Array) -> Array:
     sheet = (p > -2.2).all(-1) & (p[..., 0] < scene.inner[0] + 1.2) & (p[..., 1] < scene.inner[1] + 1.2)
     if scene.markers is not None:
         n = 60
-        picture = scene.markers.generateImage(((scene.inner[0] + 1) * n, (scene.inner[1] + 1) * n), marginSize=0)
+        picture = _printed(scene.markers, (scene.inner[0] + 1) * n, (scene.inner[1] + 1) * n)
         x = np.clip(((p + 1) * n).astype(int), 0, np.array(picture.shape[::-1]) - 1)
         return np.where(on, picture[x[..., 1], x[..., 0]] > 127, sheet).astype(float)
     black = on & ((c + r) % 2 == (0 if scene.first_black else 1))
