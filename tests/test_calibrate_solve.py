@@ -227,9 +227,11 @@ def test_a_point_behind_the_device_has_no_residual() -> None:
     [
         (1, {}),
         (2, {"cameras": 1, "layout": Layout.DIAMOND}),
-        (3, {"cameras": 5, "layout": Layout.DIAMOND, "focal": 13000.0, "size": (2448, 1632)}),
-        (4, {"offset": 600.0}),
-        (5, {"rolls": (np.pi / 2, np.pi, -np.pi / 2), "cameras": 3}),
+        pytest.param(
+            3, {"cameras": 5, "layout": Layout.DIAMOND, "focal": 13000.0, "size": (2448, 1632)}, marks=pytest.mark.verify
+        ),
+        (4, {"offset": 600.0, "cameras": 2}),
+        (5, {"rolls": (np.pi / 2, np.pi), "cameras": 2}),
         (6, {"focal": 1200.0, "size": (640, 512), "projector_focal": 4000.0, "cameras": 2, "baseline": 250.0}),
     ],
     ids=["paper", "one camera", "five long lenses", "shifted projector lens", "turned cameras", "short lenses"],
@@ -249,7 +251,7 @@ def test_exact_without_noise(seed: int, rig: dict[str, object]) -> None:
 
 
 def test_the_world_frame() -> None:
-    w = world(1)
+    w = world(1, cameras=1)
     found = calibrate.solve(w.sightings(), BOARD, w.sizes, USUAL)
     pose = found.rig.projector.pose
     centre = geometry.centre(pose)
@@ -291,13 +293,13 @@ def pulls(w: World, s: CalibrateSettings) -> np.ndarray:
 
 
 def test_predicted_sigmas_are_honest() -> None:
-    z = np.concatenate([pulls(world(s, noise=0.04, cameras=2), USUAL) for s in range(20, 26)])
+    z = np.concatenate([pulls(world(s, noise=0.04, cameras=2), USUAL) for s in range(20, 22)])
     assert (np.abs(z) < 3).mean() > 0.97
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.3
 
 
 def test_errors_that_neighbours_share_count_once() -> None:
-    worlds = [world(s, noise=0.03, shared=0.06, samples=1200, cameras=1) for s in range(40, 45)]
+    worlds = [world(s, noise=0.03, shared=0.06, samples=1200, cameras=1) for s in range(40, 42)]
     z = np.concatenate([pulls(w, USUAL) for w in worlds])
     assert (np.abs(z) < 3).mean() > 0.95
     assert np.sqrt(np.mean(z**2)) < 1.5
@@ -315,7 +317,7 @@ def test_predicted_sigmas_are_honest_long() -> None:
 
 
 def test_noise_is_told_in_units() -> None:
-    w = world(7, noise=0.05, cameras=2)
+    w = world(7, noise=0.05, cameras=1)
     found = calibrate.solve(w.sightings(), BOARD, w.sizes, USUAL)
     for name, value in found.noise.items():
         assert value == pytest.approx(0.05, rel=0.1), name
@@ -327,7 +329,7 @@ def test_noise_is_told_in_units() -> None:
 
 @pytest.mark.parametrize("how", ["centres", "corners"])
 def test_other_ways_to_tie_the_projector(how: str) -> None:
-    w = world(8, cameras=2, samples=3000)
+    w = world(8, cameras=1, samples=3000)
     found = calibrate.solve(w.sightings(), BOARD, w.sizes, replace(USUAL, projector=how))
     assert apart(found.rig, w.rig) < (1e-6 if how == "centres" else 2e-3)
 
@@ -350,8 +352,8 @@ def test_wrong_numbering_a_moved_board_and_a_gross_corner() -> None:
     w = world(10, noise=0.02)
     seen = w.sightings()
     seen[4] = replace(seen[4], corner=seen[4].corner + np.array([1, 0], dtype=np.int32))  # pose01/camera2
-    shifted = World(w.rig, [*w.poses[:5], Pose(w.poses[5].R, w.poses[5].t + np.array([0, 0, 1.5])), *w.poses[6:]], w.rng, 0.02)
-    moved = shifted.sighting(5, w.rig.cameras[2])
+    lifted = Pose(w.poses[5].R, w.poses[5].t + np.array([0, 0, 1.5]))
+    moved = World(w.rig, [lifted], w.rng, 0.02).sighting(0, w.rig.cameras[2])
     seen[17] = replace(seen[17], sample_phase=moved.sample_phase)  # pose05/camera3
     px = seen[0].corner_px.copy()
     px[20] += 6.0
@@ -374,6 +376,7 @@ def test_boards_partly_hidden_and_sightings_that_miss() -> None:
     assert apart(found.rig, w.rig) < 0.01
 
 
+@pytest.mark.verify
 def test_cameras_that_share_no_pose_are_tied_by_the_projector() -> None:
     w = world(12, poses=10, cameras=2)
     seen = [s for s in w.sightings() if (int(s.pose[4:]) < 5) == (s.camera == "camera1")]
@@ -410,28 +413,75 @@ def test_too_few_poses_and_wrong_input() -> None:
             calibrate.solve(seen, BOARD, w.sizes, replace(USUAL, **{name: value}))
 
 
+def test_phases_that_fit_no_projector() -> None:
+    w = world(4, noise=0.03, cameras=1)
+    seen = w.sightings()
+    back = np.diag([-1.0, 1.0])
+    turned = []
+    for s in seen:
+        uv = (s.sample_phase / (2 * np.pi)) @ np.linalg.pinv(s.directions).T @ back + [911, 0]
+        turned.append(replace(s, sample_phase=2 * np.pi * uv @ s.directions.T))
+    with pytest.raises(CalibrationError, match="grow the wrong way along one axis"):
+        calibrate.solve(turned, BOARD, w.sizes, USUAL)
+    n = min(len(s.sample_px) for s in seen)
+    mixed = [
+        replace(s, sample_px=s.sample_px[:n], sample_phase=seen[(i + 3) % len(seen)].sample_phase[:n],
+                sample_sigma=s.sample_sigma[:n])
+        for i, s in enumerate(seen)
+    ]  # fmt: skip
+    with pytest.raises(CalibrationError):
+        calibrate.solve(mixed, BOARD, w.sizes, USUAL)
+
+
+@pytest.mark.parametrize("ratio", [0.003, 0.25])
+def test_squares_that_are_not_square_are_noticed(ratio: float) -> None:
+    w = world(4, noise=0.03, cameras=2)
+    seen = w.sightings()
+    p = make_problem(seen, BOARD, w.sizes, USUAL)
+    boards = {f"pose{i:02d}": T for i, T in enumerate(w.poses)}
+    state = state_of(w.rig, boards, p.poses, np.array([0, 0, 0, ratio, 0]))
+    for b in p.blocks:
+        if b.points:
+            r = problem.evaluate(p, state, b, False).residual
+            seen[b.sighting] = replace(seen[b.sighting], corner_px=b.place + r + 0.03 * w.rng.standard_normal(r.shape))
+    if ratio > 0.1:
+        with pytest.raises(CalibrationError):
+            calibrate.solve(seen, BOARD, w.sizes, USUAL)
+        return
+    found = calibrate.solve(seen, BOARD, w.sizes, USUAL)
+    value, sigma = found.figures["board_shape"]["ratio"]
+    assert value == pytest.approx(ratio, abs=5 * sigma)
+    assert any("farther apart" in word for word in found.figures["words"])
+
+
 # ----------------------------------------------------------------------------------------------- lens, priors, shape
 
 
 def test_the_lens_is_chosen_by_poses_left_out() -> None:
-    w = world(13, noise=0.03, cameras=1)
-    plain = np.array([-0.2, 0, 0, 0, 0])
-    lens = w.rig.cameras[0].lens
-    w.rig = Rig(w.rig.projector, (Camera("camera1", replace(lens, distortion=plain), w.rig.cameras[0].pose),))
+    w = world(13, noise=0.01, cameras=1, focal=1500.0, size=(684, 456), baseline=150.0, height=250.0)
+    camera = w.rig.cameras[0]
+    strong = np.array([-0.2, 0.3, 0, 0, -300.0])
+    w.rig = Rig(w.rig.projector, (replace(camera, lens=replace(camera.lens, distortion=strong)),))
     found = calibrate.solve(w.sightings(), BOARD, w.sizes)
-    assert found.figures["lens_models"]["camera1"] == "k1"
+    assert found.figures["lens_models"]["camera1"] == "k1 k2 p1 p2 k3"
     assert set(found.figures["lens_scores"]["camera1"]) == set(stage.MODELS)
-    fixed = {p.name for p in found.parameters if p.device == "camera1" and p.fixed}
-    assert {"k2", "p1", "p2", "k3"} <= fixed
+    assert found.figures["lens_scores"]["camera1"]["none"] > 1000
 
 
-def test_the_simplest_model_that_is_as_good() -> None:
-    scores = {m: np.full(6, 10.0 - 0.1 * n) for n, m in enumerate(stage.MODELS)}
-    assert stage.simplest(scores, 2.0, 0.9) == "none"
-    scores |= {m: scores[m] - 50 for m in list(stage.MODELS)[3:]}
-    assert stage.simplest(scores, 2.0, 0.9) == "k1 k2 p1 p2"
-    scores["k1"] = scores["k1"] - 50 + np.array([40.0, 0, 0, 0, 0, -0.1])  # worse in one pose only: chance
-    assert stage.simplest(scores, 2.0, 0.9) == "k1"
+def test_which_lens_is_preferred() -> None:
+    rng = np.random.default_rng(0)
+    scores = {m: 10 + 0.3 * rng.normal(size=6) for m in stage.MODELS}
+    assert stage.preferred(scores, 5.0, 0.9) == stage.USUAL  # nothing speaks against the usual one
+    scores["k1 k2 p1 p2 k3"] = scores[stage.USUAL] - 5
+    assert stage.preferred(scores, 5.0, 0.9) == "k1 k2 p1 p2 k3"
+    one = np.array([30.0, 0, 0, 0, 0, 0])
+    scores["k1 k2 p1 p2 k3"] = scores[stage.USUAL] - one  # better in one pose only: chance
+    assert stage.preferred(scores, 5.0, 0.9) == stage.USUAL
+    scores = {"none": np.full(6, 60.0), "k1": 10 + np.array([9.0, 0, 0, 0, 0, -1]), "k1 k2": np.full(6, 10.0)}
+    scores |= {m: np.full(6, 20.0) for m in list(stage.MODELS)[3:]}
+    assert stage.preferred(scores, 5.0, 0.9) == "k1"  # worse than k1 k2 in one pose only
+    scores["k1"] = np.full(6, 15.0)
+    assert stage.preferred(scores, 5.0, 0.9) == "k1 k2"
 
 
 def test_priors_hold_what_is_known() -> None:
@@ -446,7 +496,7 @@ def test_priors_hold_what_is_known() -> None:
 
 
 def test_a_board_that_bends_and_a_print_that_is_longer() -> None:
-    w = world(15, cameras=2)
+    w = world(15, cameras=1)
     seen = w.sightings()
     p = make_problem(seen, BOARD, w.sizes, USUAL)
     true = np.array([0.08, -0.03, 0.05, 0.0015, 0.0008])
@@ -480,7 +530,7 @@ def test_a_board_fitted_by_a_rig() -> None:
 
 
 def test_leaving_poses_out() -> None:
-    w = world(17, noise=0.02, cameras=2, samples=1500)
+    w = world(17, noise=0.02, cameras=2, poses=6, samples=1500)
     found = calibrate.solve(w.sightings(), BOARD, w.sizes, USUAL)
     held = calibrate.leave_one_out(found, USUAL)
     assert [h.pose for h in held] == sorted(found.boards)
@@ -517,6 +567,7 @@ def session(folder: Path, board: Board) -> tuple[list[Sighting], calibrate.Sizes
     return out, calibrate.Sizes((capture.projector_width, capture.projector_height), capture.layout, cameras)
 
 
+@pytest.mark.verify
 def test_rendered_boards(shared: Path) -> None:
     folder = shared / "data" / "rendered-small"
     seen, sizes = session(folder / "calibration", BOARD)
@@ -525,6 +576,7 @@ def test_rendered_boards(shared: Path) -> None:
     assert apart(found.rig, store.read_rig(folder / "truth" / "rig.json")) < 2e-3
 
 
+@pytest.mark.verify
 def test_real_boards(shared: Path) -> None:
     board = Board((14, 10), 10.0)
     seen, sizes = session(shared / "data" / "slstudio" / "board", board)

@@ -171,8 +171,8 @@ class CalibrateSettings(_Section):
     square_pixels: bool = knob(False, "", "cameras have square pixels: fx = fy", "III-B")
     lens: str = knob("auto", "", "distortion of the cameras: none, k1, k1 k2, k1 k2 p1 p2, k1 k2 p1 p2 k3; auto = chosen by leaving poses out", "III-B")
     projector_lens: str = knob("auto", "", "distortion of the projector, likewise", "III-B")
-    lens_gain: float = knob(2.0, "", "how much better a lens term must make the poses left out, in chi-squared per term, to be used", "", 0)
-    lens_confidence: float = knob(0.9, "", "one-sided confidence at which more lens terms must make the poses left out fit better", "", 0.5, 0.9999)
+    lens_gain: float = knob(5.0, "", "what a lens term may cost the poses left out, in chi-squared, and must bring them beyond the usual terms", "", 0)
+    lens_confidence: float = knob(0.9, "", "one-sided confidence at which one lens model beats another on the poses left out", "", 0.5, 0.9999)
     projector: str = knob("samples", "", "what ties the projector: samples (phase at fixed camera pixels), centres (of white squares) or corners (phase read there)", "III-B, Fig. 4")
     board_shape: str = knob("flat", "", "what the board may be but flat and true: flat, bend, print (spacing of rows over that of columns, shear), bend print", "")
     bend_prior_mm: float = knob(0.3, "mm", "standard deviation of a board's sag at its corners, where it may bend", "", 1e-6)
@@ -183,6 +183,8 @@ class CalibrateSettings(_Section):
     projector_centre_prior: float = knob(2.0, "widths", "the same for the projector, whose lens is often shifted", "", 1e-6)
     reject_sigma: float = knob(5.0, "sigma", "corners and samples that miss the solution by more than this are left out", "", 2)
     reject_sighting: float = knob(5.0, "", "a picture whose corners or phases fit this many times worse than the others' is left out", "", 1.5)
+    max_phase_miss: float = knob(0.005, "projector widths", "phases that miss by more than this belong to no projector", "", 0)
+    max_corner_miss: float = knob(0.1, "squares", "corners that miss by more than this belong to another board", "", 0)
     rounds: int = knob(60, "", "steps of the adjustment at most", "", 1)
 
 

@@ -63,7 +63,7 @@ class Noise:
 
     def spread(self, b: Block) -> F64:
         """Standard deviation of each residual of a block on its own."""
-        return np.asarray(self.factor[b.key] * self.own.get((b.sighting, b.kind), 1.0) * b.sigma)
+        return np.asarray(self.factor.get(b.key, 1.0) * self.own.get((b.sighting, b.kind), 1.0) * b.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +339,7 @@ def chosen_models(
 ) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
     """The lens model of every device, and each model's chi-squared of the poses left out, relative to the chosen one's.
 
-    Device by device, the others as they stand, twice over; see `simplest`. Models named in the settings stand.
+    Device by device, the others as they stand, twice over; see `preferred`. Models named in the settings stand.
     """
     devices = problem.sizes.devices
     asked = asked_models(len(devices), s)
@@ -355,7 +355,7 @@ def chosen_models(
             if name != "auto":
                 continue
             scores = {m: _score(problem, first, (*models[:d], m, *models[d + 1 :]), s, tried) for m in MODELS}
-            best = simplest(scores, s.lens_gain, s.lens_confidence)
+            best = preferred(scores, s.lens_gain, s.lens_confidence)
             total = {m: float(np.nansum(c)) for m, c in scores.items()}
             told[devices[d]] = {m: round(c - total[best], 3) for m, c in total.items()}
             models = (*models[:d], best, *models[d + 1 :])
@@ -384,25 +384,33 @@ def asked_models(devices: int, s: CalibrateSettings) -> tuple[str, ...]:
     return asked
 
 
-def simplest(scores: Mapping[str, F64], gain: float, confidence: float) -> str:
-    """The simplest model whose poses left out fit as well as the best model's, but for chance.
+def preferred(scores: Mapping[str, F64], gain: float, confidence: float) -> str:
+    """The usual lens model, unless poses left out speak for fewer terms or surely for more.
 
-    `scores` holds each model's chi-squared per pose. As good means: worse by no more than `gain` per term saved, plus
-    what the spread of the difference over the poses allows at this one-sided `confidence` (after the one-standard-error
-    rule: Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, 2nd edition, section 7.10). Every lens
-    has some distortion, so "none" gets no benefit of this doubt.
+    `scores` holds each model's chi-squared per pose. A term that is there but left out shifts the others by more than
+    their sigma says, so the usual ones stay while they cost the poses left out no more than `gain` each, which chance
+    may; else the simplest that no other simpler one surely beats. Surely: beyond what the spread of the difference over
+    the poses allows at this one-sided `confidence` (after the one-standard-error rule: Hastie, Tibshirani and Friedman,
+    The Elements of Statistical Learning, 2nd edition, section 7.10); "none", which no lens is, gets no such benefit.
     """
     total = {m: float(np.nansum(c)) for m, c in scores.items()}
-    best = min(total, key=lambda m: total[m])
-    for m in sorted(scores, key=lambda m: len(MODELS[m])):
-        more = scores[m] - scores[best]
-        more = more[np.isfinite(more)]
-        error = float(np.sqrt(len(more)) * np.std(more, ddof=1)) if len(more) > 1 and MODELS[m] else 0.0
-        error *= float(student.ppf(confidence, max(len(more) - 1, 1)))
-        saved = max(len(MODELS[best]) - len(MODELS[m]), 0)
-        if len(more) and total[m] - total[best] <= gain * saved + error:
+    terms = {m: len(MODELS[m]) for m in scores}
+    fewer = sorted((m for m in scores if terms[m] < terms[USUAL]), key=lambda m: terms[m])
+    if any(total[USUAL] - total[m] > gain * (terms[USUAL] - terms[m]) for m in fewer):
+        best = min(fewer, key=lambda m: total[m])
+        chance = {m: _chance(scores[m] - scores[best], confidence) if terms[m] else 0.0 for m in fewer}
+        return next(m for m in fewer if total[m] - total[best] <= chance[m])
+    for m in (m for m in scores if terms[m] > terms[USUAL]):
+        better = scores[USUAL] - scores[m]
+        if np.nansum(better) > gain * (terms[m] - terms[USUAL]) + _chance(better, confidence):
             return m
-    return best
+    return USUAL
+
+
+def _chance(difference: F64, confidence: float) -> float:
+    """What the sum of per-pose differences (P,) may be by chance, at a one-sided confidence (Student's t)."""
+    d = difference[np.isfinite(difference)]
+    return float(np.sqrt(len(d)) * np.std(d, ddof=1) * student.ppf(confidence, len(d) - 1)) if len(d) > 1 else 0.0
 
 
 def _score(

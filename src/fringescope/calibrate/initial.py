@@ -64,6 +64,7 @@ def begin(problem: Problem, focal: dict[int, float], pinned: dict[int, tuple[flo
     Raises CalibrationError if no camera can be tied to the projector.
     """
     seen = [s for s in _gather(problem) if s is not None]
+    _same_handed(problem, seen)
     lenses = {c: _camera(problem, c, seen, focal.get(c), pinned.get(c)) for c in sorted({s.camera for s in seen})}
     seen = [_with_readings(s, lenses[s.camera]) for s in seen]
     by_camera = {c: [s for s in seen if s.camera == c] for c in lenses}
@@ -76,6 +77,23 @@ def begin(problem: Problem, focal: dict[int, float], pinned: dict[int, tuple[flo
         )
     best = min(found, key=lambda c: found[c].score / max(len(found[c].chosen), 1) - len(found[c].chosen))
     return _assemble(problem, lenses, seen, found, best)
+
+
+def _same_handed(problem: Problem, seen: Sequence[Seen]) -> None:
+    """Raises CalibrationError where one of camera and projector, which both face the board, sees it as in a mirror."""
+    for c in sorted({s.camera for s in seen}):
+        turns = [np.linalg.det(_slope(s.at, s.uv)) > 0 for s in seen if s.camera == c and len(s.uv) >= 6]
+        if turns and np.mean(turns) < 0.5:
+            raise CalibrationError(
+                f"{problem.sizes.devices[c]}: the projector's phases grow the wrong way along one axis, as in a "
+                "mirror; turn round the order of the frames or the sign of cycles_per_pixel of one direction"
+            )
+
+
+def _slope(px: F64, uv: F64) -> F64:
+    """The linear part (2, 2) of the best affine map of px (n, 2) to uv (n, 2)."""
+    fit, *_ = np.linalg.lstsq(np.column_stack([px - px.mean(axis=0), np.ones(len(px))]), uv, rcond=None)
+    return np.asarray(fit[:2])
 
 
 def readings_of(problem: Problem, lens: F64) -> dict[int, tuple[Reading, ...]]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fringescope import geometry
-from fringescope.calibrate.adjust import NORMAL_MAD, Fit, residuals
+from fringescope.calibrate.adjust import NORMAL_MAD, Fit, released, residuals
 from fringescope.calibrate.initial import projector_coordinates
 from fringescope.calibrate.problem import (
     CORNERS,
@@ -49,12 +50,14 @@ UNITS = {
     **dict.fromkeys(POSE[3:], "mm"),
 }  # fmt: skip
 MAP_POINTS = 400  #: samples around a corner that its projector coordinate is read from
+LEAST_PRINT = 5e-4  #: scale ratio or shear of a print that is worth a word
+LEAST_SAG_MM = 0.02  #: and sag
 GROWN = 1.1  #: the measuring volume over what the boards filled
 
 
 def calibration(
-    problem: Problem, fit: Fit, used: Sequence[Sighting], left: tuple[LeftOut, ...], figures: dict[str, Any],
-    s: CalibrateSettings,
+    problem: Problem, fit: Fit, used: Sequence[Sighting], left: tuple[LeftOut, ...], models: tuple[str, ...],
+    figures: dict[str, Any], s: CalibrateSettings,
 ) -> Calibration:  # fmt: skip
     """The solved problem as the world sees it. Uncertainty of a turn is that of a small turn w in exp(w) R."""
     state = fit.state
@@ -75,7 +78,9 @@ def calibration(
     told = _figures(problem, fit, used, rig) | figures | {"condition": condition, "steps": fit.steps}
     kept = {b.sighting for b in problem.blocks}
     seen = tuple(n for i, n in enumerate(used) if i in kept)
-    words = _words(problem, parameters, s)
+    suspected = suspected_shape(problem, fit, models, s)
+    told["board_shape"] = {name: list(value) for name, value in suspected.items()}
+    words = [*_words(problem, parameters, s), *_shape_words(suspected)]
     if words:
         told["words"] = words
     return Calibration(
@@ -316,6 +321,40 @@ def _local(d: F64, uv: F64) -> tuple[F64, F64] | None:
         return None
     spread = np.sqrt(np.sum(r[keep] ** 2, axis=0) / max(keep.sum() - 6, 1))
     return fit[0], np.maximum(spread * np.sqrt(np.linalg.inv(N)[0, 0]), 1e-9)
+
+
+def suspected_shape(
+    problem: Problem, fit: Fit, models: tuple[str, ...], s: CalibrateSettings
+) -> dict[str, tuple[float, float]]:
+    """What the residuals say of the board's shape, were it free: value and sigma per term, by one step onwards."""
+    loose = replace(s, board_shape="bend print", bend_prior_mm=1e3, print_prior=1.0)
+    freed = released(problem, models, loose)
+    H, g = folded(freed, normal(freed, fit.state, fit.weights))
+    inverse, _ = inverse_normal(H)
+    at = slice(problem.shape_at, problem.shape_at + len(SHAPE))
+    step, sigma = freed.free @ -(inverse @ g), np.sqrt(np.maximum(np.diag(freed.free @ inverse @ freed.free.T), 0))
+    value = fit.state.shape + step[at]
+    return {n: (float(v), float(e)) for n, v, e in zip(SHAPE, value, sigma[at], strict=True)}
+
+
+def _shape_words(suspected: dict[str, tuple[float, float]]) -> list[str]:
+    """What to say where the board is surely not as described."""
+    out = []
+    ratio, shear = suspected["ratio"], suspected["shear"]
+    if abs(ratio[0]) > max(5 * ratio[1], LEAST_PRINT):
+        out.append(
+            f"the board's rows stand {100 * ratio[0]:+.2f} % farther apart than its columns: measure the print; "
+            'calibrate.board_shape=print allows for it'
+        )
+    if abs(shear[0]) > max(5 * shear[1], LEAST_PRINT):
+        out.append(
+            f"the board's columns lean by {np.degrees(shear[0]):.3f} deg against its rows; "
+            'calibrate.board_shape=print allows for it'
+        )
+    sag = max((abs(v) for n, (v, e) in suspected.items() if n.startswith("bend") and abs(v) > 5 * e), default=0.0)
+    if sag > LEAST_SAG_MM:
+        out.append(f"the board seems bent by {sag:.2g} mm at its corners; calibrate.board_shape=bend allows for it")
+    return out
 
 
 def _words(problem: Problem, parameters: Sequence[Parameter], s: CalibrateSettings) -> list[str]:

@@ -73,9 +73,10 @@ def solve(sightings: Sequence[Sighting], board: Board, sizes: Sizes, s: Calibrat
     fit = _final(problem, state, models, s)
     fit, problem, out = _late(problem, fit, models, used, s)
     _tilted(problem, fit.state, s)
+    _believable(problem, fit, s)
     left += out
     figures: dict[str, Any] = {"lens_models": dict(zip(sizes.devices, models, strict=True)), "lens_scores": scores}
-    return outcome.calibration(problem, fit, used, tuple(left), figures, s)
+    return outcome.calibration(problem, fit, used, tuple(left), models, figures, s)
 
 
 # --------------------------------------------------------------------------------------------------------- the input
@@ -179,6 +180,31 @@ def _tilted(problem: Problem, state: State, s: CalibrateSettings) -> None:
         )
 
 
+def _believable(problem: Problem, fit: Fit, s: CalibrateSettings) -> None:
+    """Raises CalibrationError where the solution explains nothing."""
+    if (fit.state.lens[0, :2] <= 0).any():
+        raise CalibrationError(
+            "the projector's phases grow the wrong way along one axis, as in a mirror; turn round the order of the "
+            "frames or the sign of cycles_per_pixel of that direction"
+        )
+    for c, name in enumerate(problem.sizes.cameras, start=1):
+        if (fit.state.lens[c, :2] <= 0).any():
+            raise CalibrationError(f"{name}: its pictures are mirrored; turn them round")
+    for b in problem.blocks:
+        miss = fit.noise.factor[b.key] * float(np.median(b.sigma))
+        name = problem.sizes.devices[b.device]
+        if b.kind == PHASE and miss > s.max_phase_miss * max(problem.sizes.plane):
+            raise CalibrationError(
+                f"{name}: phases miss any projector by {miss:.2g} units; check that pictures and fringes of a pose "
+                "belong together, and the order of the frames"
+            )
+        if b.kind == CORNERS and miss > s.max_corner_miss * np.sqrt(np.prod(np.ptp(b.place, axis=0)) / len(b.place)):
+            raise CalibrationError(
+                f"{name}: corners miss any flat board of {problem.board.inner_corners[0]} x "
+                f"{problem.board.inner_corners[1]} by {miss:.2g} px; check board.json and that its squares are square"
+            )
+
+
 # -------------------------------------------------------------------------------------------------- what belongs
 
 
@@ -267,7 +293,7 @@ def fit_pose(problem: Problem, state: State, noise: Noise, pose: int, R: F64, t:
         for limit in (np.inf, 30.0, 8.0):
             found = residuals(single, state)
             own = robust_noise(single, found)
-            wide = Noise({k: max(v, noise.factor[k]) for k, v in own.factor.items()}, noise.effect)
+            wide = Noise({k: max(v, noise.factor.get(k, v)) for k, v in own.factor.items()}, noise.effect)
             state, _ = minimise(single, state, hard_weights(single, found, wide, limit), 20, 1e-6)
     except (CalibrationError, np.linalg.LinAlgError):
         return None
