@@ -228,7 +228,9 @@ def test_a_point_behind_the_device_has_no_residual() -> None:
         (1, {}),
         (2, {"cameras": 1, "layout": Layout.DIAMOND}),
         pytest.param(
-            3, {"cameras": 5, "layout": Layout.DIAMOND, "focal": 13000.0, "size": (2448, 1632)}, marks=pytest.mark.verify
+            3,
+            {"cameras": 5, "layout": Layout.DIAMOND, "focal": 13000.0, "size": (2448, 1632)},
+            marks=pytest.mark.verify,
         ),
         (4, {"offset": 600.0, "cameras": 2}),
         (5, {"rolls": (np.pi / 2, np.pi), "cameras": 2}),
