@@ -339,7 +339,8 @@ def ripple_um(d: Decoded, grid: Grid) -> float:
     return float(np.hypot(c[3], c[4]))
 
 
-@pytest.mark.parametrize("preset", ["single", pytest.param("pair", marks=pytest.mark.verify)])  # 12 bits mono, 8 bits Bayer
+# 12 bits mono, 8 bits Bayer
+@pytest.mark.parametrize("preset", ["single", pytest.param("pair", marks=pytest.mark.verify)])
 def test_the_twins_ripple_goes(preset: str) -> None:
     view, rig = twin_view(1.6, (3, 3), preset)
     d, grid = scanned(view, rig, None)

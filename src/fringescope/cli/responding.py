@@ -134,7 +134,7 @@ def _plane_ripples(before: Decoded, after: Decoded) -> list[RippleCurve]:
             a, b = response.plane_ripple(before, i), response.plane_ripple(after, i)
         except EmptyResultError:
             continue
-        title = f"{before.camera}: off a smooth surface, N = {a.steps} ({a.amplitude:.4f} to {b.amplitude:.4f})"
+        title = f"{before.camera}, smooth surface: {a.amplitude:.4f} to {b.amplitude:.4f} rad"
         if b.rest < 0.3:
             out.append(RippleCurve(title, a.phase, a.mean, b.mean))
     return out

@@ -41,8 +41,8 @@ def response_picture(
     with mpl.rc_context(_FONT):
         fig = Figure(figsize=(12, 2.0 + 3.3 * rows), dpi=110, facecolor=PAPER)
         top = 1 - 1.5 / (2.0 + 3.3 * rows)
-        grid = fig.add_gridspec(rows, 3, left=0.06, right=0.98, bottom=0.55 / (2.0 + 3.3 * rows), top=top,
-                                wspace=0.28, hspace=0.5)  # fmt: skip
+        grid = fig.add_gridspec(rows, 3, left=0.07, right=0.98, bottom=0.55 / (2.0 + 3.3 * rows), top=top,
+                                wspace=0.36, hspace=0.5)  # fmt: skip
         fig.text(0.06, 1 - 0.35 / (2.0 + 3.3 * rows), title, fontsize=14, fontweight="bold", va="center")
         for i, line in enumerate(response.words[:3]):
             fig.text(0.06, 1 - (0.62 + 0.19 * i) / (2.0 + 3.3 * rows), line, fontsize=9.5, color=PALE, va="center")
