@@ -67,7 +67,7 @@ def test_a_shift_along_the_ray_is_measured_with_its_sign(rig: Rig) -> None:
     grids = [plane_grid(rig, 0, normal=(0, 0, 1.0), noise=0.0, lift=0.05),
              plane_grid(rig, 1, normal=(0, 0, 1.0), noise=0.0)]  # fmt: skip
     pair = evaluate.agreement(grids, rig).pairs[0]
-    o, d = geometry.world_rays(rig.cameras[0], [[rig.cameras[0].lens.width / 2, rig.cameras[0].lens.height / 2]])
+    _o, d = geometry.world_rays(rig.cameras[0], [[rig.cameras[0].lens.width / 2, rig.cameras[0].lens.height / 2]])
     want = 50 * abs(d[0, 2])  # um along the plane's normal
     assert pair.cameras == (rig.cameras[0].name, rig.cameras[1].name)
     assert pair.shift_um == pytest.approx(want, rel=0.03)
@@ -77,7 +77,8 @@ def test_a_shift_along_the_ray_is_measured_with_its_sign(rig: Rig) -> None:
 def test_views_that_share_nothing_agree_on_nothing(rig: Rig) -> None:
     grid = plane_grid(rig, 0)
     found = evaluate.agreement([grid], rig)
-    assert found.median_um is None and found.pairs == ()
+    assert found.median_um is None
+    assert found.pairs == ()
     hidden = replace(plane_grid(rig, 1), reasons=np.ones(grid.reasons.shape, np.uint16))
     assert evaluate.agreement([grid, hidden], rig).median_um is None
 
@@ -100,7 +101,8 @@ def test_the_board_tells_scale_whatever_end_the_views_number_from(rig: Rig, scal
     found = evaluate.board_trueness([plane_grid(rig, v, seed=5) for v in range(3)], sightings, big, rig)
     assert found.corners == 108
     assert found.scale_error_ppm == pytest.approx(1e6 * (scale - 1), abs=max(4 * found.scale_sigma_ppm, 20))
-    assert found.views_um is not None and found.views_um < 5
+    assert found.views_um is not None
+    assert found.views_um < 5
     assert found.rms_um < 3 + 3e3 * (scale - 1) * 15
 
 
@@ -126,7 +128,8 @@ def test_two_directions_test_each_other(rig: Rig) -> None:
     d = Direction(g, phase, flat, flat)
     decoded = Decoded(grid.camera, (d,), (), (), flat, flat, grid.reasons, NoiseModel(0, 0))
     exact = evaluate.epipolar_residual(grid, decoded, d, rig)
-    assert exact is not None and exact.systematic_um < 0.3  # float32 phases of 200 rad
+    assert exact is not None
+    assert exact.systematic_um < 0.3
     off = replace(d, phase=phase + np.float32(2 * np.pi * g[1] * 2))  # two units of the plane
     found = evaluate.epipolar_residual(grid, decoded, off, rig)
     depth = np.median(geometry.transform(rig.projector.pose, grid.xyz)[..., 2])
@@ -146,7 +149,8 @@ def test_the_verdict_says_why(rig: Rig) -> None:
     assert verdict(rig, 500.0).verdict == "drifted"
     assert "calibrate anew" in verdict(rig, 500.0).words[0]
     nothing = verdict(rig, None)
-    assert nothing.verdict == "unknown" and "nothing to compare" in nothing.words[-1]
+    assert nothing.verdict == "unknown"
+    assert "nothing to compare" in nothing.words[-1]
     assert verdict(rig, None, sphere_radius_error_um=-300.0).verdict == "drifted"
     assert verdict(rig, 1.0, blind=("camera2",)).verdict == "unknown"
     held = {"calibration": {"held_out": [{"corner_mm_rms": 0.6}, {"corner_mm_rms": None}, "x"]}}
@@ -167,7 +171,9 @@ def test_rendered_captures(shared, tmp_path, capsys) -> None:
     assert cli.run(["verify", str(data / "calibration" / "pose03"), "--rig", str(truth), "--json"]) == 0
     out = json.loads(capsys.readouterr().out)
     assert out["verdict"] == "ok"
-    assert out["board_rms_um"] < 1.5 and abs(out["scale_error_ppm"]) < 30 and out["epipolar_systematic_um"] < 2
+    assert out["board_rms_um"] < 1.5
+    assert abs(out["scale_error_ppm"]) < 30
+    assert out["epipolar_systematic_um"] < 2
     bad = tmp_path / "bad.json"
     store.write_rig(bad, turned(store.read_rig(truth), 1, 2e-4))
     for capture in ("sphere", "calibration/pose03"):
@@ -180,7 +186,7 @@ def test_rendered_captures(shared, tmp_path, capsys) -> None:
     assert "found in no view" in capsys.readouterr().err
 
 
-def test_a_board_that_must_be_there(rig: Rig, shared) -> None:
+def test_a_board_that_must_be_there(shared) -> None:
     capture = store.read_capture(shared / "data" / "rendered-small" / "plane")
     truth = store.read_rig(shared / "data" / "rendered-small" / "truth" / "rig.json")
     one = store.view_inputs(capture)[:1]
@@ -203,4 +209,5 @@ def test_bad_input_gets_one_line(args, status, word, tmp_path, monkeypatch, caps
         (tmp_path / "r.json").write_text("{}")
     assert cli.run(["verify", *args]) == status
     err = capsys.readouterr().err.strip().splitlines()
-    assert len(err) == 1 and word in err[0]
+    assert len(err) == 1
+    assert word in err[0]

@@ -126,8 +126,8 @@ def crop_rows(decoded: Decoded, first: int, last: int) -> Decoded:
 
     directions = tuple(replace(d, phase=crop(d.phase), sigma=crop(d.sigma), order_margin=crop(d.order_margin))
                        for d in decoded.directions)  # fmt: skip
-    maps = {name: crop(getattr(decoded, name)) for name in ("background", "modulation", "reasons")}
-    return replace(decoded, directions=directions, sets=(), gray=(), **maps)
+    A, B, reasons = crop(decoded.background), crop(decoded.modulation), crop(decoded.reasons)
+    return replace(decoded, directions=directions, sets=(), gray=(), background=A, modulation=B, reasons=reasons)
 
 
 def join_rows(parts: Sequence[Decoded]) -> Decoded:
@@ -140,5 +140,7 @@ def join_rows(parts: Sequence[Decoded]) -> Decoded:
         replace(same[0], **{n: join([getattr(d, n) for d in same]) for n in ("phase", "sigma", "order_margin")})
         for same in zip(*(p.directions for p in parts), strict=True)
     )
-    maps = {name: join([getattr(p, name) for p in parts]) for name in ("background", "modulation", "reasons")}
-    return replace(parts[0], directions=directions, **maps)
+    A, B = join([p.background for p in parts]), join([p.modulation for p in parts])
+    return replace(
+        parts[0], directions=directions, background=A, modulation=B, reasons=join([p.reasons for p in parts])
+    )
