@@ -230,30 +230,35 @@ def at_squares(b: Bench, s: Seen, corner: Any, px: F64) -> Features:
 
 
 def at_discs(b: Bench, s: Seen) -> Features:
-    """Centre of gravity of each disc's light: the centre of its picture, an ellipse."""
-    share = (s.white - DARK) / (1 - DARK)
+    """The centre of the ellipse through each disc's outline, where its light falls to one half."""
+    share = ((s.white - DARK) / (1 - DARK)).astype(np.float32)
     index = white_squares()
     truth = b.truth(BOARD.centre_mm(index))
+    turn, reach = np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(0.7, 1.35, 40)
+    rays = np.stack([np.outer(reach, np.cos(turn)), np.outer(reach, np.sin(turn)), np.zeros((40, 60))], -1)
     found = []
-    for at, radius in zip(b.seen(BOARD.centre_mm(index)), _radii(b, index), strict=True):
-        reach = radius + 4 * b.view.blur_px + 2
-        x0, y0 = np.floor(at - reach).astype(int)
-        x1, y1 = np.ceil(at + reach).astype(int) + 1
-        y, x = np.mgrid[y0:y1, x0:x1]
-        w = share[y0:y1, x0:x1] * (np.hypot(x - at[0], y - at[1]) < reach)
-        centre = np.array([(w * x).sum(), (w * y).sum()]) / w.sum()
-        inside = np.hypot(x - centre[0], y - centre[1]) < 0.7 * radius * np.cos(np.radians(b.view.tilt_deg))
-        px = np.column_stack([x[inside], y[inside]]).astype(float)
-        found.append(smooth(px, s.uv[y[inside], x[inside]], centre))
+    for middle in BOARD.centre_mm(index):
+        px = b.seen((middle + BOARD.square_mm / 2 * rays).reshape(-1, 3)).reshape(40, 60, 2)
+        light = cv2.remap(share, px.astype(np.float32), None, cv2.INTER_LINEAR)
+        k = np.argmax(light < 0.5, axis=0)
+        each = np.arange(60)
+        part = (light[k - 1, each] - 0.5) / (light[k - 1, each] - light[k, each])
+        outline = px[k - 1, each] + part[:, None] * (px[k, each] - px[k - 1, each])
+        centre = ellipse_centre(outline)
+        shrunk = centre + 0.6 * (outline - centre)
+        inside = cv2.fillConvexPoly(np.zeros(share.shape, np.uint8), np.rint(shrunk).astype(np.int32), 1)
+        y, x = np.nonzero(inside)
+        found.append(smooth(np.column_stack([x, y]).astype(float), s.uv[y, x], centre))
     return {"disc, centre of its picture": (np.array(found), truth)}
 
 
-def _radii(b: Bench, index: Any) -> F64:
-    """Longest half axis of the discs' pictures, pixels (n,), about."""
-    centre = BOARD.centre_mm(index)
-    px = b.seen(centre)
-    ring = [BOARD.square_mm / 2 * np.array((np.cos(a), np.sin(a), 0)) for a in np.linspace(0, np.pi, 8, endpoint=False)]
-    return np.max([np.linalg.norm(b.seen(centre + d) - px, axis=1) for d in ring], axis=0)
+def ellipse_centre(outline: F64) -> F64:
+    """Of the conic a x^2 + b xy + c y^2 + d x + e y = 1 through points (n, 2), by least squares."""
+    middle = outline.mean(0)
+    size = float(np.ptp(outline, axis=0).max())
+    x, y = ((outline - middle) / size).T
+    a, b, c, d, e = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(len(x)), rcond=None)[0]
+    return np.asarray(middle - size * np.linalg.solve([[2 * a, b], [b, 2 * c]], [d, e]))
 
 
 def ours(b: Bench, s: Seen) -> tuple[Any, F64, Features]:
