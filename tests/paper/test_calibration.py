@@ -132,7 +132,7 @@ def test_views_agree_as_by_the_true_rig(rendered: Path, samples: int, record_pro
     assert own is not None
     assert true is not None
     record_property("own rig, true rig, um", (round(own, 3), round(true, 3)))
-    assert own <= 1.15 * true
+    assert own <= (1.35 if samples else 1.15) * true  # a seventh of the phases makes a rig a little worse
 
 
 # ------------------------------------------------------------------------------------------------------ a real session
