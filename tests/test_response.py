@@ -11,8 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
-from fringescope import capture, denoise, patterns, phase, response, store, triangulate
+from fringescope import capture, denoise, patterns, phase, pipeline, response, store, triangulate
 from fringescope.cli import run
 from fringescope.devices import simulated
 from fringescope.errors import CaptureError, EmptyResultError, FormatError, UsageError
@@ -411,6 +412,8 @@ def test_the_mugs_two_frequencies_agree_after_a_correction_learnt_from_themselve
     assert r.needed
     assert r.figures["pairs"][0]["median_before"] == pytest.approx(4.2, abs=0.3)
     assert disagreement(decoded(view, r)) <= 0.6
+    assert disagreement(pipeline.decode_view(view, S)) > 3
+    assert disagreement(pipeline.decode_view(replace(view, response=r), S)) <= 0.6
 
 
 @pytest.mark.verify
@@ -477,6 +480,18 @@ def test_command_on_loose_fringes_and_a_capture(tmp_path: Path, capsys: pytest.C
     store.write_capture(tmp_path / "capture", 912, 640, Layout.GRID, [view])
     assert run(["response", str(tmp_path / "capture"), "--out", str(tmp_path / "b.json")]) == 0
     assert "needs correction" in capsys.readouterr().out
+    phases = []
+    for name, extra in (("plain", []), ("freed", ["--response", str(out)])):
+        assert run(["decode", str(tmp_path / "capture"), "--out", str(tmp_path / name), *extra]) == 0
+        phases.append(tifffile.imread(tmp_path / name / view.plan.camera / "phase_0.tif"))
+    moved = np.abs(phases[1] - phases[0])
+    greatest = math.asin(0.25)  # ((1 + cos) / 2)^2 is cos + cos 2 / 4 and a constant; three steps see cos 2 backwards
+    assert np.nanpercentile(moved, 99.5) == pytest.approx(greatest, rel=0.1)
+    capsys.readouterr()
+    line = ["decode", str(tmp_path / "capture"), "--out", str(tmp_path / "no"), "--response"]
+    assert run([*line, str(tmp_path / "nowhere.json")]) == 1
+    assert "nowhere.json" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
 
 
 def test_command_on_a_staircase(tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator) -> None:

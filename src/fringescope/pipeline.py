@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, triangulate
+from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, response, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError
 from fringescope.settings import Settings
 from fringescope.types import (
@@ -44,11 +44,15 @@ def decode_view(view: ViewInput, s: Settings) -> Decoded:
 
     Raises CaptureError if frames are missing or do not fit, DecodeError if the sets do not span the projector's field.
     """
-    measured = phase.measure(view.frames, view.plan, s.phase, view.noise)
-    decoded = phase.settle_order(measured, view.plan, s.phase)
+    decoded = phase.settle_order(measured_view(view, s), view.plan, s.phase)
     reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)
     reasons = denoise.connected(decoded, reasons, None, s.denoise)
     return phase.with_reasons(decoded, reasons)
+
+
+def measured_view(view: ViewInput, s: Settings) -> Decoded:
+    """One camera's frames, as they come, to wrapped phases, freed from the view's response. Raises CaptureError."""
+    return response.corrected(phase.measure(view.frames, view.plan, s.phase, view.noise), view.response)
 
 
 def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
@@ -64,8 +68,8 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
 def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
     """One camera's frames to absolute phase, with the reasons of all masks (Fig. 7). Raises as `scan_view`."""
     geometry.check_baseline(rig, rig.camera(view.plan.camera))
-    decoded = phase.measure(view.frames, view.plan, s.phase, view.noise)  # II-C; frames may still be arriving
-    decoded = phase.settle_order(decoded, view.plan, s.phase, rig, s.denoise.volume_margin)
+    measured = measured_view(view, s)  # II-C; frames may still be arriving
+    decoded = phase.settle_order(measured, view.plan, s.phase, rig, s.denoise.volume_margin)
     reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)  # III-D 1
     reasons = denoise.monotonic(decoded, reasons, rig, s.denoise)  # III-D 2
     reasons = denoise.connected(decoded, reasons, rig, s.denoise)  # III-D 3
@@ -83,8 +87,7 @@ def see_board(view: ViewInput, board: Board, pose: str, s: Settings) -> tuple[Si
     Raw frames are kept and decoded band by band, so that 24 frames of 20 megapixels take less than 3 GB. Raises
     CaptureError or DecodeError for frames that do not fit.
     """
-    frames = [(key, frame) for key, frame in view.frames]
-    decoded, mean = decode_bands(replace(view, frames=frames), s)
+    decoded, mean = decode_bands(view, s)
     try:
         return calibrate.see(decoded, mean, view.plan, board, pose, s.board), mean, ""
     except CalibrationError as e:
@@ -108,7 +111,7 @@ def decode_bands(view: ViewInput, s: Settings) -> tuple[Decoded, F32]:
         top, end = max(row - overlap, 0), min(row + rows, H)
         below = min(end + overlap, H)
         band = [(key, np.ascontiguousarray(f[top:below])) for key, f in frames]
-        measured = phase.measure(band, view.plan, s.phase, noise)
+        measured = measured_view(replace(view, frames=band, noise=noise), s)
         decoded = phase.settle_order(measured, view.plan, s.phase)
         reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)
         parts.append(phase.crop_rows(phase.with_reasons(decoded, reasons), row - top, end - top))
@@ -255,7 +258,7 @@ def scan(
         grids.append(grid)
         photos.append(picture(view, decoded, s))
         times[f"scan_view {grid.camera}"] = perf_counter() - start
-        figures["views"][grid.camera] = _figures(decoded, grid)
+        figures["views"][grid.camera] = _figures(view, decoded, grid)
         figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
     order = np.argsort([g.view for g in grids])
     grids, photos = [grids[i] for i in order], [photos[i] for i in order]
@@ -292,11 +295,13 @@ def _silent(_what: str, _share: float) -> None:
     """No progress is shown."""
 
 
-def _figures(decoded: Decoded, grid: Grid) -> dict[str, Any]:
+def _figures(view: ViewInput, decoded: Decoded, grid: Grid) -> dict[str, Any]:
     """What scan.json tells of a view: noise, sigma, modulation."""
     ok = grid.valid
     some = bool(ok.any())
+    r = view.response
     return {
+        "response": None if r is None else {"gamma": r.gamma, "needed": r.needed},
         "noise": {"a": decoded.noise.a, "b": decoded.noise.b, "source": decoded.noise.source},
         "sigma_median_mm": float(np.median(grid.sigma[ok])) if some else None,
         "modulation_median": float(np.median(decoded.modulation[ok])) if some else None,

@@ -211,7 +211,6 @@ class EvidenceSettings(_Section):
 class ResponseSettings(_Section):
     """The response of projector and camera together: gamma, saturation (II-C)."""
 
-    correct: str = knob("off", "", "whether reconstruct and decode correct phases: off, file (a response.json that is given) or self (from the capture's own sets)", "II-C")
     harmonics: int = knob(5, "", "harmonics of the fringe, from the second on, that may differ from the power law", "II-C", 1, 8)
     law_tolerance: float = knob(0.02, "fringe amplitudes", "how far harmonics are expected to lie from the power law; what the capture does not show stays near it", "", 1e-4, 1)
     expected_blur: float = knob(1.5, "projector-plane units", "blur of the projector that is expected (standard deviation); weakens the harmonics of fine fringes", "", 0.01, 50)

@@ -38,7 +38,7 @@ def board(
     made = export.best_board(paper, landscape, wanted, square_mm, pattern, marker_mm, dictionary)
     page = export.draw(*made, invert=invert, ink=ink)
     data = export.pdf_bytes(page) if out.suffix.lower() == ".pdf" else export.svg_text(page).encode()
-    doc = export.board_doc(page.board)
+    doc = store.board_document(page.board)
     with (
         store.new_file(out, force=force) as picture,
         store.new_file(out.with_name("board.json"), force=force) as description,

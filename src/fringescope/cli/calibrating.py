@@ -11,15 +11,27 @@ import typer
 
 from fringescope import __version__
 from fringescope.cli.app import app
-from fringescope.cli.common import Force, Json, Out, Progress, SetOption, SettingsFile, emit, existing, load_settings
-from fringescope.errors import CalibrationError, UsageError
+from fringescope.cli.common import (
+    Force,
+    Json,
+    Out,
+    Progress,
+    ResponseFile,
+    SetOption,
+    SettingsFile,
+    emit,
+    existing,
+    load_response,
+    load_settings,
+)
+from fringescope.errors import CalibrationError, CaptureError, DecodeError, UsageError
 
 if TYPE_CHECKING:
     from fringescope import evaluate as judging
     from fringescope.calibrate import Sizes
     from fringescope.settings import Settings
     from fringescope.store import Session
-    from fringescope.types import F32, U8, Board, Calibration, Evidence, Rig, Sighting
+    from fringescope.types import F32, U8, Board, Calibration, Evidence, Response, Rig, Sighting
 
 # ----------------------------------------------------------------------------------------------------------- calibrate
 
@@ -35,15 +47,22 @@ class Looked:
     wrong: dict[str, str] = field(default_factory=dict)
 
 
-def look(session: Session, s: Settings, progress: Progress) -> Looked:
-    """Every picture of a session, one after the other, so that one view's frames are in memory."""
+def look(session: Session, s: Settings, progress: Progress, response: Response | None = None) -> Looked:
+    """Every picture of a session, one after the other, so that one view's frames are in memory.
+
+    Frames that cannot be read or decoded cost their own picture, by name.
+    """
     from fringescope import pipeline, store
 
     out = Looked()
-    inputs = [(pose, v) for pose, capture in session.poses for v in store.view_inputs(capture)]
+    inputs = [(pose, v) for pose, capture in session.poses for v in store.view_inputs(capture, response)]
     for pose, view in progress.track(inputs, "looking at the boards", len(inputs)):
         name = f"{pose}/{view.plan.camera}"
-        found, mean, why = pipeline.see_board(view, session.board, pose, s)
+        try:
+            found, mean, why = pipeline.see_board(view, session.board, pose, s)
+        except (CaptureError, DecodeError) as e:
+            out.wrong[name] = str(e)
+            continue
         out.pictures[name] = _reduced(mean)
         if found is None:
             out.wrong[name] = why
@@ -115,6 +134,7 @@ def calibrate(
     report: Annotated[
         Path | None, typer.Option(help="The report, a page for any browser; else beside the rig, as RIG.html.")
     ] = None,
+    response: ResponseFile = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -139,18 +159,18 @@ def calibrate(
                 else:
                     found = store.read_session(session)
                     board, sizes = found.board, _sizes(found)
-                    looked = look(found, s, progress)
+                    looked = look(found, s, progress, load_response(response))
                 why = [f"{name}: {why}" for name, why in looked.wrong.items()]
                 c, evidence = pipeline.calibrate_rig(looked.seen, board, sizes, s, progress.share, why)
                 store.write_json(rig_file, store.rig_document(rig_with_evidence(c, evidence, s)))
                 text = report_.calibration_page(
-                    c, evidence, c.sightings, None, overlays(looked, c), f"Calibration of {title}"
+                    c, evidence, c.sightings, None, overlays(looked, c), f"Calibration of {title}", looked.wrong
                 )
                 page_file.write_text(text, encoding="utf-8")
-        except CalibrationError as e:
+        except (CalibrationError, CaptureError, DecodeError) as e:
             failure = str(e)
             text = report_.calibration_page(
-                None, None, looked.seen, failure, overlays(looked, None), f"Calibration of {title}"
+                None, None, looked.seen, failure, overlays(looked, None), f"Calibration of {title}", looked.wrong
             )
             page_file.write_text(text, encoding="utf-8")
     if failure:

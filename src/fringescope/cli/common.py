@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.progress import TaskID
 
-    from fringescope.types import PixelFormat
+    from fringescope.types import PixelFormat, Response
 
 T = TypeVar("T")
 
@@ -39,6 +39,17 @@ SetOption = Annotated[
 Views = Annotated[
     list[str] | None, typer.Option("--view", metavar="CAMERA", help="Only this camera's view; may be repeated.")
 ]
+
+ResponseFile = Annotated[
+    Path | None, typer.Option("--response", metavar="FILE.json", help="Free the phases from what `response` measured.")
+]
+
+
+def load_response(file: Path | None) -> Response | None:
+    """The response in a file, or none. Raises FormatError."""
+    from fringescope import store
+
+    return None if file is None else store.read_response(file)
 
 
 def load_settings(file: Path | None, changes: Iterable[str] | None) -> tree.Settings:

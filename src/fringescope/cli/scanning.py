@@ -16,11 +16,13 @@ from fringescope.cli.common import (
     Json,
     Out,
     Progress,
+    ResponseFile,
     SetOption,
     SettingsFile,
     Views,
     emit,
     existing,
+    load_response,
     load_settings,
     numbers,
     pixel_format,
@@ -48,6 +50,7 @@ def scan_into(
     all_points: bool = False,
     preview: bool = True,
     only: Sequence[str] | None = None,
+    response: Path | None = None,
 ) -> tuple[Scan, dict[str, Any]]:
     """Reconstructs a capture (of some cameras `only`) and writes the scan into a folder that is being made; returns it
     with its scan.json.
@@ -58,7 +61,8 @@ def scan_into(
     c = picked(store.read_capture(capture), only)
     r = store.read_rig(rig)
     store.check_rig(c, r)
-    scan = pipeline.scan(store.view_inputs(c), r, s, all_points=all_points, progress=progress.share)
+    views = store.view_inputs(c, load_response(response))
+    scan = pipeline.scan(views, r, s, all_points=all_points, progress=progress.share)
     if preview and scan.preview is not None:
         page = export.viewer_page(scan.preview, title=folder_title(capture))
         (folder / "view.html").write_text(page, encoding="utf-8")
@@ -120,6 +124,7 @@ def reconstruct(
     ] = False,
     preview: Annotated[bool, typer.Option(help="Also write view.html, which shows the surface in a browser.")] = True,
     only: Views = None,
+    response: ResponseFile = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -131,8 +136,9 @@ def reconstruct(
     s = load_settings(settings, set_)
     with store.new_folder(out, marker="scan.json", force=force) as tmp, Progress() as progress:
         _, doc = scan_into(
-            tmp, capture, rig, s, progress, grids=grids, all_points=all_points, preview=preview, only=only
-        )
+            tmp, capture, rig, s, progress,
+            grids=grids, all_points=all_points, preview=preview, only=only, response=response,
+        )  # fmt: skip
     emit({"scan": str(out), **doc}, json, scan_summary(doc, out))
 
 
@@ -163,6 +169,7 @@ def decode(
     time: Annotated[int | None, typer.Option(help="Of a stack: which time.")] = None,
     pixel_format_: Annotated[str | None, typer.Option("--pixel-format", help="Of a stack: as Mono12.")] = None,
     only: Views = None,
+    response: ResponseFile = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -183,6 +190,8 @@ def decode(
         if capture.is_file() and capture.suffix.lower() in (".tif", ".tiff"):
             if only:
                 raise UsageError(f"--view {only[0]}: a stack has one view; leave the option out")
+            if response is not None:
+                raise UsageError("--response is for captures; a bare stack has no period that it could be applied to")
             n = None if steps is None else numbers(steps, "--steps", int)[0]
             view, note, digest = importing.stack_view(capture, n, axis, time, pixel_format(pixel_format_))
             views, extra = (view,), {"source": capture.name, "note": note}
@@ -191,7 +200,7 @@ def decode(
             raise UsageError("--steps, --axis, --time, --pixel-format are for a TIFF stack; a capture says them itself")
         else:
             c = picked(store.read_capture(capture), only)
-            views, digest = store.view_inputs(c), ""
+            views, digest = store.view_inputs(c, load_response(response)), ""
         decoded = []
         for v in progress.track(views, "decoding", len(views)):
             d = pipeline.decode_view(v, s)

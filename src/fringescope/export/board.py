@@ -181,19 +181,6 @@ def _words(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def board_doc(board: Board) -> dict[str, Any]:
-    """What `board.json` says of it."""
-    if board.dictionary:
-        return {
-            "pattern": "charuco",
-            "squares": list(board.squares),
-            "square_mm": board.square_mm,
-            "marker_mm": board.marker_mm,
-            "dictionary": board.dictionary,
-        }
-    return {"pattern": "checkerboard", "inner_corners": list(board.inner_corners), "square_mm": board.square_mm}
-
-
 # ------------------------------------------------------------------------------------------------------------- drawing
 
 

@@ -46,19 +46,22 @@ def calibration_page(
     failure: str | None = None,
     overlays: Mapping[str, U8] | None = None,
     title: str = "Calibration report",
+    blind: Mapping[str, str] | None = None,
 ) -> str:
     """HTML of the report. `sightings` are all that were found, `overlays` their pictures by `Sighting.name`.
+
+    `blind` says, by the same names, why the other pictures show no board.
 
     With `failure`, what went wrong in one line; `calibration` and `evidence` may then be missing. Nothing is fetched
     and no script runs. Pictures are shrunk until the page stays below six megabytes.
     """
     parts = [f"<h1>{escaped(title)}</h1>"]
     if failure is not None or calibration is None or evidence is None:
-        parts += failed(failure or "no calibration came of it", sightings, overlays or {})
+        parts += failed(failure or "no calibration came of it", sightings, overlays or {}, blind or {})
     else:
         parts += [_verdict(evidence), _words(evidence), _rig(calibration), _devices(calibration, evidence)]
         parts += [_predicted(evidence.prediction), _poses(evidence.poses), _parameters(calibration, evidence)]
-    parts.append(pictures(calibration, sightings, overlays or {}))
+    parts.append(pictures(calibration, sightings, overlays or {}, blind or {}))
     parts.append(f"<footer>{LIMITS} Made by Fringescope {escaped(__version__)}.</footer>")
     page = (resources.files("fringescope.report") / "calibration.html").read_text(encoding="utf-8")
     return page.replace("@TITLE@", escaped(title)).replace("@BODY@", "\n".join(p for p in parts if p))

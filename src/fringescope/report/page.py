@@ -48,12 +48,14 @@ def figure(kind: str, caption: str, drawing: str) -> str:
 # ------------------------------------------------------------------------------------------------------------- pictures
 
 
-def pictures(c: Calibration | None, sightings: Sequence[Sighting], overlays: Mapping[str, U8]) -> str:
-    """What was found in every picture, with the picture where `overlays` has it by the sighting\'s name."""
-    if not sightings and not overlays:
+def pictures(
+    c: Calibration | None, sightings: Sequence[Sighting], overlays: Mapping[str, U8], blind: Mapping[str, str]
+) -> str:
+    """What was found in every picture, or why nothing, with the picture where `overlays` has it by its name."""
+    if not sightings and not overlays and not blind:
         return ""
     known = {s.name: s for s in sightings}
-    names = sorted(set(known) | set(overlays))
+    names = sorted(set(known) | set(overlays) | set(blind))
     data = _encoded(overlays)
     left: dict[str, list[str]] = {}
     for o in c.left_out if c is not None else ():
@@ -67,8 +69,8 @@ def pictures(c: Calibration | None, sightings: Sequence[Sighting], overlays: Map
         what = "no board found"
         if s is not None:
             what = f"{len(s.corner)} corners, {len(s.square)} white squares, {len(s.sample_px)} samples"
-        said = (*(s.words if s is not None else ()), *left.get(name, ()))
-        warn = "".join(f'<br><span class="warn">{micro(w)}</span>' for w in said)
+        said = (*(s.words if s is not None else (blind.get(name, ""),)), *left.get(name, ()))
+        warn = "".join(f'<br><span class="warn">{micro(w)}</span>' for w in said if w)
         img = ""
         if name in data:
             img = f'<img loading="lazy" src="{data[name]}" alt="{escaped(name)}">'
@@ -106,10 +108,13 @@ def _jpeg(picture: U8, width: int) -> str:
 # -------------------------------------------------------------------------------------------------------------- failure
 
 
-def failed(failure: str, sightings: Sequence[Sighting], overlays: Mapping[str, U8]) -> list[str]:
+def failed(
+    failure: str, sightings: Sequence[Sighting], overlays: Mapping[str, U8], blind: Mapping[str, str]
+) -> list[str]:
     """What there is to say where no calibration came of it."""
-    poses = sorted({s.pose for s in sightings} | {n.split("/")[0] for n in overlays})
-    cameras = sorted({s.camera for s in sightings} | {n.split("/")[1] for n in overlays if "/" in n})
+    names = {s.name for s in sightings} | set(overlays) | set(blind)
+    poses = sorted({n.split("/")[0] for n in names})
+    cameras = sorted({n.split("/")[1] for n in names if "/" in n})
     there = {(s.pose, s.camera): s for s in sightings}
     advice = _advice(sightings, poses, cameras)
     items = "".join(f"<li>{escaped(capital(a))}</li>" for a in advice)
@@ -125,7 +130,8 @@ def failed(failure: str, sightings: Sequence[Sighting], overlays: Mapping[str, U
     for pose in poses:
         mine = [there.get((pose, k)) for k in cameras]
         found = "".join(f"<td>{len(s.corner)} · {len(s.square)}</td>" if s else "<td class=far>none</td>" for s in mine)
-        words = "; ".join(f"{k}: {w}" for k in cameras if (pose, k) in there for w in there[pose, k].words)
+        said = {k: s.words if s else (blind.get(f"{pose}/{k}", ""),) for k, s in zip(cameras, mine, strict=True)}
+        words = "; ".join(f"{k}: {w}" for k, each in said.items() for w in each if w)
         rows.append(f"<tr><td>{escaped(pose)}</td>{found}<td class=note>{micro(words)}</td></tr>")
     out.append(
         '<h2>What was found</h2><p class="lead">Corners · white squares in each picture.</p>'

@@ -19,7 +19,9 @@ GAP = 1.5  #: how far neighbouring corners of a row may lie apart to be joined, 
 
 
 def sighting_picture(image: NDArray[Any], sighting: Sighting, residuals: Residuals | None = None) -> U8:
-    """The picture (h, w, 3) uint8 with what was found: an image (H, W) or (H, W, 3) in any scale, mosaics too.
+    """The picture (h, w, 3) uint8 with what was found: an image (H, W) or (H, W, 3) of any codes, mosaics too.
+
+    An image that is smaller than `sighting.size` shows the same, reduced.
 
     Yellow rings: corners, joined row by row from the first (white disc; its arrows are the board's x, red, and y,
     green). Green diamonds: white squares. Blue dots: phase samples. Red crosses: left out by the solve, where
@@ -32,6 +34,7 @@ def sighting_picture(image: NDArray[Any], sighting: Sighting, residuals: Residua
     way = cv2.INTER_AREA if k < 1 else cv2.INTER_CUBIC
     out = cv2.cvtColor(cv2.resize(grey, size, interpolation=way), cv2.COLOR_GRAY2RGB)
     unit = max(size) / LONGEST
+    k *= grey.shape[1] / sighting.size[0]
     left_out = _left_out(sighting, residuals)
     _samples(out, _place(sighting.sample_px, k), left_out[1], unit)
     corners = _place(sighting.corner_px, k)

@@ -178,7 +178,7 @@ def words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSetti
     told = ", ".join(f"{e:.4f} +- {d:.4f} rad at N = {n}" for n, (e, d) in sets.items())
     fair = [n for n, e in r.error_rad.items() if e < s.negligible_rad]
     if r.needed:
-        yield f"needs correction: {told}; give this response to reconstruct and decode"
+        yield f"needs correction: {told}; give this file to reconstruct and decode (--response)"
         more = f", or take {min(fair)} steps ({r.error_rad[min(fair)]:.4f} rad)" if fair else ""
         yield f"or do without: draw the patterns through the table 'predistortion'{more}"
     elif r.saturated > BLOWN:

@@ -10,12 +10,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from fringescope.errors import CaptureError, FormatError, RigError
+from fringescope.errors import CaptureError, RigError
 from fringescope.store import files
 from fringescope.store.images import Images, check_frame, check_header, split_page, write_png
-from fringescope.store.rig import explain, parse_layout
+from fringescope.store.rig import parse_layout, read_model
 from fringescope.types import (
     AnyArray,
     FrameKey,
@@ -25,6 +25,7 @@ from fringescope.types import (
     NoiseModel,
     PatternPlan,
     PixelFormat,
+    Response,
     Rig,
     Role,
     ViewInput,
@@ -156,12 +157,7 @@ def read_capture(path: Path | str) -> Capture:
     """
     path = Path(path)
     document = path / files.CAPTURE if path.is_dir() else path
-    doc = files.read_json(document, "a capture (a folder with capture.json)")
-    files.check_format(doc, document, FORMAT, VERSION)
-    try:
-        m = _Capture.model_validate(doc)
-    except ValidationError as e:
-        raise FormatError(explain(e, document)) from None
+    m = read_model(document, "a capture (a folder with capture.json)", FORMAT, VERSION, _Capture)
     p = m.projector
     layout = parse_layout(p.layout, document)
     images = Images(document.parent)
@@ -247,15 +243,16 @@ def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
     return FringeSet((g[0], g[1]), steps, s.exposure_us), list(s.frames)
 
 
-def view_inputs(capture: Capture) -> tuple[ViewInput, ...]:
+def view_inputs(capture: Capture, response: Response | None = None) -> tuple[ViewInput, ...]:
     """What the pipeline takes: per view its plan, its frames (read lazily, may be iterated again) and its picture.
 
+    `response` is the one that all views are to be freed from.
     The ring-light picture is read at once. Raises CaptureError here, or while frames are read, naming the file.
     """
     out = []
     for v in capture.views:
         color = None if v.color is None else capture.images.frame(v.color, v.plan.pixel_format, v.size)
-        out.append(ViewInput(v.plan, Frames(capture, v), color, v.noise))
+        out.append(ViewInput(v.plan, Frames(capture, v), color, v.noise, response))
     return tuple(out)
 
 

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from fringescope.errors import FormatError
-from fringescope.store import files
-from fringescope.store.rig import explain
+from fringescope.store.rig import read_model
 from fringescope.store.scan import plain
 from fringescope.types import Response
 
@@ -45,12 +44,7 @@ def response_document(response: Response, predistortion: Sequence[int] = ()) -> 
 def read_response(path: Path | str) -> Response:
     """The response in a file. Raises FormatError."""
     path = Path(path)
-    doc = files.read_json(path, "a response (response.json)")
-    files.check_format(doc, path, FORMAT, VERSION)
-    try:
-        m = _Response.model_validate(doc)
-    except ValidationError as e:
-        raise FormatError(explain(e, path)) from None
+    m = read_model(path, "a response (response.json)", FORMAT, VERSION, _Response)
     if any(not k.isdigit() for k in (*m.error_rad, *m.error_sigma)) or max(map(abs, m.harmonics)) > 2:
         raise FormatError(f"{path}: harmonics beyond 2, or errors not by number of steps; measure the response again")
     try:

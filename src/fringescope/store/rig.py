@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fringescope.errors import FormatError, RigError
 from fringescope.store import files
 from fringescope.types import F64, Camera, Layout, Lens, Pose, Projector, Rig, Volume
+
+M = TypeVar("M", bound=BaseModel)
 
 FORMAT, VERSION = "fringescope-rig", 1
 LARGEST = 1e7  #: no number of a rig is larger: mm, pixels, distortion
@@ -92,6 +94,19 @@ def explain(e: ValidationError, path: Path) -> str:
     return f"{path}: {place}: needed {needed}; came {files.shown(first['input'])}{more}"
 
 
+def read_model(path: Path, what: str, format_: str, version: int, model: type[M]) -> M:
+    """The JSON object of one of our files, checked: its format, its version, and every key that `model` knows.
+
+    Raises FormatError, with `what` was needed.
+    """
+    doc = files.read_json(path, what)
+    files.check_format(doc, path, format_, version)
+    try:
+        return model.model_validate(doc)
+    except ValidationError as e:
+        raise FormatError(explain(e, path)) from None
+
+
 def parse_layout(name: str, path: Path) -> Layout:
     """ "grid" or "diamond". Raises FormatError."""
     try:
@@ -106,12 +121,7 @@ def read_rig(path: Path | str) -> Rig:
     Raises FormatError where it is no rig or of a higher version, RigError where it cannot be a rig (NaN, singular K).
     """
     path = Path(path)
-    doc = files.read_json(path, "a rig")
-    files.check_format(doc, path, FORMAT, VERSION)
-    try:
-        m = _Rig.model_validate(doc)
-    except ValidationError as e:
-        raise FormatError(explain(e, path)) from None
+    m = read_model(path, "a rig", FORMAT, VERSION, _Rig)
     if m.units != "mm":
         raise RigError(f'{path}: units {files.shown(m.units)}; needed "mm"')
     layout = parse_layout(m.projector.layout, path)

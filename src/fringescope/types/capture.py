@@ -12,6 +12,7 @@ import numpy as np
 
 from fringescope.errors import CaptureError
 from fringescope.types.names import F32, AnyArray, Layout, PixelFormat
+from fringescope.types.response import Response
 
 ROUNDING = 1.0 / 12.0  #: variance of rounding to whole codes, codes squared
 
@@ -149,10 +150,11 @@ class ViewInput:
     """What the pipeline takes of one view: its plan, its frames one by one in any order, its ring-light picture.
 
     A frame is (H, W) uint8 or uint16 (RGB8: (H, W, 3)), raw as the sensor gave it. `color` is raw in
-    the same format, or None.
+    the same format, or None. `response`: what its phases are to be freed from, or None.
     """
 
     plan: ViewPlan
     frames: Iterable[tuple[FrameKey, AnyArray]]
     color: AnyArray | None = None
     noise: NoiseModel | None = None
+    response: Response | None = None

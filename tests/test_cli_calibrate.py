@@ -1,0 +1,144 @@
+"""`fringescope calibrate` from folders to a rig and its report: what fails, what is left out by name, what repeats."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fringescope import calibrate, cli, report, store
+from fringescope.types import Board
+from tests.board_pictures import Scene, take
+
+THIN = ["--set", "board.max_samples=300"]
+
+
+@pytest.fixture
+def session(shared, tmp_path):
+    """Makes a session of some of the rendered poses, so that it can be spoilt."""
+
+    def make(*poses: int, cameras: int = 3) -> Path:
+        source, folder = shared / "data" / "rendered-small" / "calibration", tmp_path / "session"
+        folder.mkdir()
+        shutil.copy(source / "board.json", folder)
+        for pose in poses:
+            name = f"pose{pose:02d}"
+            shutil.copytree(source / name, folder / name)
+            if cameras < 3:
+                path = folder / name / "capture.json"
+                doc = json.loads(path.read_text())
+                doc["views"] = doc["views"][:cameras]
+                path.write_text(json.dumps(doc))
+        return folder
+
+    return make
+
+
+def failed(args, capsys) -> str:
+    """The one line on stderr of a command that ends with status 1."""
+    assert cli.run(["calibrate", *map(str, args)]) == 1
+    lines = [x for x in capsys.readouterr().err.strip().splitlines() if not x.endswith(" s")]
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def test_a_failed_calibration_leaves_a_report_and_no_rig(session, tmp_path, capsys) -> None:
+    folder, rig = session(0, cameras=1), tmp_path / "rig.json"
+    assert "pose" in failed([folder, "--out", rig, *THIN], capsys)
+    assert not rig.exists()
+    page = (tmp_path / "rig.html").read_text()
+    assert "No calibration" in page
+    assert "pose00" in page and "camera1" in page  # noqa: PT018
+
+
+def test_a_rig_that_is_there_is_kept_before_any_work(session, tmp_path, capsys) -> None:
+    rig = tmp_path / "rig.json"
+    rig.write_text("mine")
+    assert "--force" in failed([session(0, cameras=1), "--out", rig], capsys)
+    assert rig.read_text() == "mine"
+    assert not (tmp_path / "rig.html").exists()
+
+
+def test_pictures_that_cannot_be_read_are_left_out_by_name(session, tmp_path, capsys) -> None:
+    folder, rig = session(0, 1, 2, 3, cameras=2), tmp_path / "rig.json"
+    frame = folder / "pose01" / "camera2" / "05.png"
+    frame.write_bytes(frame.read_bytes()[:5000])
+    assert cli.run(["calibrate", str(folder), "--out", str(rig), "--json", *THIN]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["not_used"]) == 1
+    assert told["not_used"][0].startswith("pose01/camera2: ")
+    assert "05.png" in told["not_used"][0]
+    page = (tmp_path / "rig.html").read_text()
+    assert "05.png" in page
+    # the rig's file carries what was seen: the solve repeats without the pictures
+    shutil.rmtree(folder)
+    again = tmp_path / "again.json"
+    assert cli.run(["calibrate", str(rig), "--out", str(again), "--json"]) == 0
+    a, b = store.read_rig(rig), store.read_rig(again)
+    for one, two in zip(a.devices, b.devices, strict=True):
+        np.testing.assert_allclose(two.lens.K, one.lens.K, rtol=1e-5)
+        np.testing.assert_allclose(two.pose.t, one.pose.t, atol=2e-3)
+    assert a.volume is not None
+    board, sightings = store.read_observations(rig)
+    assert board.inner_corners == (11, 8)
+    assert {s.name for s in sightings} == {f"pose{p:02d}/camera{c}" for p in range(4) for c in (1, 2)} - {
+        "pose01/camera2"
+    }
+
+
+def test_frames_of_another_size_name_both_poses(session, tmp_path, capsys) -> None:
+    folder = session(0, 1, cameras=1)
+    path = folder / "pose01" / "capture.json"
+    doc = json.loads(path.read_text())
+    doc["projector"]["width"] = 1024
+    path.write_text(json.dumps(doc))
+    line = failed([folder, "--out", tmp_path / "rig.json"], capsys)
+    assert "1024 x 1140" in line and "pose00" in line  # noqa: PT018
+    assert "1024 x 1140" in (tmp_path / "rig.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "word"),
+    [
+        (lambda f: (f / "board.json").unlink(), "board.json"),
+        (lambda f: (f / "board.json").write_text('{"pattern": "dots", "square_mm": 5.0}'), "checkerboard"),
+        (lambda f: (f / "board.json").write_text('{"pattern": "checkerboard", "square_mm": 5.0}'), "inner_corners"),
+        (lambda f: (f / "board.json").write_text(
+            '{"pattern": "checkerboard", "inner_corners": [11, 8], "square_mm": -5.0}'), "positive"),
+        (lambda f: shutil.rmtree(f / "pose00"), "pose00"),
+    ],
+)  # fmt: skip
+def test_a_session_that_is_none(session, tmp_path, capsys, spoil, word) -> None:
+    folder = session(0, cameras=1)
+    spoil(folder)
+    assert word in failed([folder, "--out", tmp_path / "rig.json"], capsys)
+    assert not (tmp_path / "rig.json").exists()
+
+
+def test_observations_that_are_damaged(tmp_path, capsys) -> None:
+    rig = tmp_path / "plain.json"
+    rig.write_text('{"format": "fringescope-rig", "version": 1}')
+    assert "no observations" in failed([rig, "--out", tmp_path / "new.json"], capsys)
+    board = {"pattern": "checkerboard", "inner_corners": [3, 4], "square_mm": 5.0}
+    for broken in ({}, {"corner": {"dtype": "<i4", "shape": [2, 2], "deflate": "eA=="}}, 7):
+        rig.write_text(json.dumps({"board": board, "observations": [{"pose": "a", "camera": "b", "corner": broken}]}))
+        assert "calibrate anew" in failed([rig, "--out", tmp_path / "new.json"], capsys)
+
+
+def test_report_pictures_that_were_reduced_show_corners_where_they_are() -> None:
+    """A yellow ring stands around the same board corner in the whole picture and in one of half the size."""
+    one = take(Scene())
+    h, w = one.image.shape
+    board = Board((one.inner[0] + 1, one.inner[1] + 1), one.square)
+    sighting = calibrate.see(one.decoded, one.image.astype(np.float32), one.plan, board, "pose")
+    half = one.image.reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3))
+    for image in (one.image, half):
+        drawn = report.sighting_picture(image, sighting)
+        scale = drawn.shape[1] / w
+        yellow = np.argwhere((drawn[..., 0] > 200) & (drawn[..., 1] > 150) & (drawn[..., 2] < 80))[:, ::-1]
+        places = (sighting.corner_px + 0.5) * scale - 0.5
+        nearest = np.linalg.norm(yellow[:, None] - places[None], axis=2).min(axis=0)
+        gap = scale * np.min(np.linalg.norm(sighting.corner_px[0] - sighting.corner_px[1:], axis=1))
+        assert nearest.max() < 0.4 * gap
+        assert np.linalg.norm(yellow[:, None] - places[None], axis=2).min(axis=1).mean() < 0.4 * gap
