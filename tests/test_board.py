@@ -91,7 +91,7 @@ def test_markers_are_read_and_lie_as_opencv_lays_them(tmp_path, options, squares
 
 def test_an_outside_reader_prints_it_at_true_scale(tmp_path):
     if shutil.which("pdftoppm") is None:
-        pytest.skip("no pdftoppm here")
+        pytest.skip("no pdftoppm here (tools/system_packages.sh installs it)")
     pdf, _ = printed(tmp_path, "--paper", "letter", "--squares", "9x6", "--square-mm", "20")
     subprocess.run(["pdftoppm", "-r", "254", "-gray", tmp_path / "board.pdf", tmp_path / "p"], check=True, timeout=60)
     picture = cv2.imread(str(next(tmp_path.glob("p*.pgm"))), cv2.IMREAD_GRAYSCALE)

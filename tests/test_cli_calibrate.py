@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -142,3 +143,20 @@ def test_report_pictures_that_were_reduced_show_corners_where_they_are() -> None
         gap = scale * np.min(np.linalg.norm(sighting.corner_px[0] - sighting.corner_px[1:], axis=1))
         assert nearest.max() < 0.4 * gap
         assert np.linalg.norm(yellow[:, None] - places[None], axis=2).min(axis=1).mean() < 0.4 * gap
+
+
+def test_patterns_for_a_board_need_no_rig(tmp_path, capsys) -> None:
+    out = tmp_path / "patterns"
+    line = ["patterns", "--plan", "calibration", "--projector", "60x80", "--layout", "diamond", "--out", str(out)]
+    assert cli.run([*line, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    directions = [s["cycles_per_pixel"] for s in told["views"][0]["sets"]]
+    assert any(g[1] == 0 for g in directions)
+    assert any(g[0] == 0 for g in directions)
+    image = cv2.imread(str(next(out.rglob("00.png"))), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (80, 60)
+    for wrong in (["--plan", "paper"], ["--plan", "calibration"], [*line[1:5], "--layout", "hexagon"]):
+        assert cli.run(["patterns", *wrong, "--out", str(tmp_path / "no")]) == 2
+    rig = tmp_path / "rig.json"
+    assert cli.run(["patterns", str(rig), *line[1:]]) == 2
+    assert "leave out" in capsys.readouterr().err

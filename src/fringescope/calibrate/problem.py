@@ -4,7 +4,7 @@ and steps of Levenberg and Marquardt. The projector's frame is the reference whi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -344,9 +344,3 @@ def centre_block(s: Sighting, board: Board, camera: int, pose: int, number: int)
     xy = np.ascontiguousarray(board.centre_mm(s.square)[ok, :2])
     place, sigma = np.array(s.square_uv[ok], dtype=np.float64), np.array(s.square_sigma[ok], dtype=np.float64)
     return Block(PHASE, camera, pose, number, place, sigma, xy)
-
-
-def by_pose(problem: Problem) -> Iterator[tuple[int, list[int]]]:
-    """Pose numbers and their blocks' numbers."""
-    for p in range(len(problem.poses)):
-        yield p, [i for i, b in enumerate(problem.blocks) if b.pose == p]

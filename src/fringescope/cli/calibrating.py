@@ -181,13 +181,11 @@ def calibrate(
 def _observations(rig: Path, looked: Looked) -> tuple[Board, Sizes]:
     """The board, the sizes and, into `looked`, the sightings that a calibrated rig carries."""
     from fringescope import store
-    from fringescope.calibrate import Sizes
+    from fringescope.calibrate import sizes_of
 
     board, stored = store.read_observations(rig)
     looked.seen.extend(stored)
-    r = store.read_rig(rig)
-    cameras = {c.name: (c.lens.width, c.lens.height) for c in r.cameras}
-    return board, Sizes((r.projector.width, r.projector.height), r.projector.layout, cameras)
+    return board, sizes_of(store.read_rig(rig))
 
 
 def _sizes(session: Session) -> Sizes:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fringescope.devices.simulated import World
     from fringescope.importing import Evidence, ImportedView, Recipe
     from fringescope.settings import Settings
-    from fringescope.types import PatternPlan, ViewInput
+    from fringescope.types import PatternPlan, PixelFormat, ViewInput
 
 
 # ------------------------------------------------------------------------------------------------------------ simulate
@@ -307,9 +307,15 @@ def _refuse_doubtful(evidence: dict[str, Evidence], as_given: bool) -> None:
 
 @app.command()
 def patterns(
-    rig: Annotated[Path, typer.Argument(help="A rig.json.")],
     out: Out,
+    rig: Annotated[
+        Path | None, typer.Argument(help="A rig.json; not needed for --plan calibration with --projector.")
+    ] = None,
     plan: Annotated[str, typer.Option(help="paper (Table I), planned, horizontal or calibration.")] = "paper",
+    projector: Annotated[
+        str | None, typer.Option(help="Without a rig: the projector's device pixels, as 912x1140.")
+    ] = None,
+    layout: Annotated[str, typer.Option(help="Without a rig: the projector's lattice, diamond or grid.")] = "grid",
     pixel_format_: Annotated[str, typer.Option("--pixel-format", help="Of the cameras.")] = "BayerRG8",
     background: Annotated[float, typer.Option(help="A expected on the specimen, 8-bit codes.", min=0)] = 70,
     modulation: Annotated[float, typer.Option(help="B expected on the specimen, 8-bit codes.", min=0.1)] = 50,
@@ -324,10 +330,15 @@ def patterns(
     from fringescope.types import NoiseModel, PixelFormat
 
     s = load_settings(settings, set_)
+    fmt = pixel_format(pixel_format_) or PixelFormat.BAYER_RG8
+    if rig is None:
+        _calibration_patterns(out, plan, projector, layout, fmt, s, force, json)
+        return
+    if projector is not None:
+        raise UsageError(f"--projector {projector}: the rig says it; leave out one of them")
     r = store.read_rig(rig)
     size_ = (r.projector.width, r.projector.height)
     cameras = [c.name for c in r.cameras]
-    fmt = pixel_format(pixel_format_) or PixelFormat.BAYER_RG8
     plans = {
         "paper": lambda: p.paper_plan(r, fmt, s.patterns),
         "planned": lambda: p.plan(r, fmt, s.patterns),
@@ -358,6 +369,25 @@ def patterns(
     warnings = [] if plan == "calibration" else list(p.validate(planned, r, s.patterns))
     told = {"patterns": str(out), "expected": expected, "warnings": warnings, **doc}
     emit(told, json, [*lines, *warnings])
+
+
+def _calibration_patterns(
+    out: Path, plan: str, projector: str | None, layout: str, fmt: PixelFormat, s: Settings, force: bool, json: bool
+) -> None:
+    """What a board session needs of a projector of which nothing is known but its pixels; the same for all cameras."""
+    from fringescope import patterns as p
+    from fringescope import store
+    from fringescope.types import Layout
+
+    if plan != "calibration" or projector is None:
+        raise UsageError(f"--plan {plan} without a rig; needed RIG, or --plan calibration --projector WIDTHxHEIGHT")
+    if layout not in ("grid", "diamond"):
+        raise UsageError(f"--layout {layout}; needed grid or diamond")
+    planned = p.calibration_plan(size(projector, "--projector"), Layout(layout), ["every-camera"], fmt, s.patterns)
+    total = len(planned.views[0].keys)
+    with Progress() as progress, store.new_folder(out, marker="plan.json", force=force) as tmp:
+        doc = store.put_patterns(tmp, planned, progress.track(p.plan_images(planned, s.patterns), "patterns", total))
+    emit({"patterns": str(out), **doc}, json, [f"{out}: {total} images, the same for every camera"])
 
 
 @app.command()

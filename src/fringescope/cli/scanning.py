@@ -289,10 +289,9 @@ def _error_maps(found: Evaluation, name: str) -> U8:
     for what, form in forms:
         if form is None:
             continue
-        error = np.where(form.own, 1000 * form.error_mm, np.nan)
         s = form.spread
         figures = [("std", f"{s.std_um:.2f} um"), ("rms", f"{s.rms_um:.2f} um"), ("points", f"{s.points:,}")]
-        maps.append(report.error_map(form.flat_mm, error, f"{name}: {what}", figures))
+        maps.append(report.error_map(form.flat_mm, form.deviation_um, f"{name}: {what}", figures))
     width = max(m.shape[1] for m in maps)
     padded = [np.pad(m, ((0, 0), (0, width - m.shape[1]), (0, 0)), constant_values=255) for m in maps]
     return np.concatenate(padded, axis=0)

@@ -19,7 +19,6 @@ from fringescope.store.capture import Capture, read_capture
 from fringescope.store.rig import explain
 from fringescope.types import AnyArray, Board, Calibration, Sighting
 
-OBSERVATIONS = "fringescope-observations"
 MOST_BYTES = 1 << 30  #: no stored array is larger
 
 

@@ -172,11 +172,6 @@ class Renderer:
             xyz.reshape(h, w, 3), uv.reshape(h, w, 2), light.reshape(h, w), share.reshape(h, w), shape.reshape(h, w)
         )
 
-    def forget(self, camera: str | None = None) -> None:
-        """Drops the geometry kept for one camera, or for all."""
-        for name in [camera] if camera else list(self._views):
-            self._views.pop(name, None)
-
     # ---------------------------------------------------------------------------------------------------- geometry
 
     def _tiles(self, cam: Camera) -> list[slice]:
