@@ -38,6 +38,19 @@ def compose(T_ab: Pose, T_bc: Pose) -> Pose:
     return Pose(T_ab.R @ T_bc.R, T_ab.R @ T_bc.t + T_ab.t)
 
 
+def similarity(a: ArrayLike, b: ArrayLike) -> tuple[Pose, float]:
+    """The rigid motion that lays points a (n, 3) best on b (n, 3), and the scale that would fit better still.
+
+    Least squares (Umeyama 1991, doi:10.1109/34.88573): `b = scale R (a - mean a) + mean b`; the pose has scale 1.
+    """
+    p, q = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    mp, mq = p.mean(axis=0), q.mean(axis=0)
+    U, S, Vt = np.linalg.svd((q - mq).T @ (p - mp))
+    D = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U * D @ Vt
+    return Pose(R, mq - R @ mp), float((S * D).sum() / ((p - mp) ** 2).sum())
+
+
 def centre(T_device_world: Pose) -> F64:
     """Optical centre of a device in world mm, (3,)."""
     c: F64 = -T_device_world.R.T @ T_device_world.t

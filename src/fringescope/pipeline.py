@@ -104,7 +104,7 @@ def decode_bands(view: ViewInput, s: Settings) -> tuple[Decoded, F32]:
         raise CaptureError(f"view '{view.plan.camera}': no frames came")
     H, W = frames[0][1].shape[:2]
     rows = max(64, BAND // W // 2 * 2)
-    noise = view.noise or _noise_of_rows(view.plan, frames, s)
+    noise = view.noise or (_noise_of_rows(view.plan, frames, s) if rows < H else None)  # one band tells its own
     overlap = 2 * 4 * (s.phase.order_votes // 2)
     parts: list[Decoded] = []
     for row in range(0, H, rows):

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fringescope import geometry
 from fringescope.calibrate import initial, outcome
@@ -237,8 +236,7 @@ def _rigid(A: F64, B: F64) -> tuple[float, float]:
     """Rms distance of B (n, 3) from A moved rigidly onto it, and the scale of B over A (Umeyama 1991)."""
     if len(A) < 4:
         return float("nan"), float("nan")
-    a, b = A - A.mean(axis=0), B - B.mean(axis=0)
-    turn, _ = Rotation.align_vectors(b, a)
-    moved = turn.apply(a)
-    return float(np.sqrt(np.mean(np.sum((moved - b) ** 2, axis=1)))), float(np.sum(moved * b) / np.sum(moved**2))
+    T, scale = geometry.similarity(A, B)
+    rest = B - geometry.transform(T, A)
+    return float(np.sqrt(np.mean(np.sum(rest**2, axis=1)))), scale
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -270,32 +271,42 @@ def stereo_rms(problem: Problem, fit: Fit, used: Sequence[Sighting]) -> tuple[fl
 def read_at_corners(
     s: Sighting, board: Board, camera: int, pose: int, number: int, *, every: bool = False
 ) -> Block | None:
-    """The projector's coordinate at corners, by a plane map (homography) of the samples around each; None without.
+    """The projector's coordinate at corners (see `at_corners`); None without.
 
-    The map is fitted to the samples within a square and a half (Moreno and Taubin 2012, doi:10.1109/3DIMPVT.2012.77);
     `every` keeps corners without enough samples around, as NaN.
     """
-    b = sample_block(s, camera, pose, number)
-    if b is None:
-        return None
-    rows, uv = projector_coordinates(b)
-    if len(rows) < 20:
-        return None
-    px = b.place[rows]
-    side = _square_px(s)
-    out, sigma = np.full((len(s.corner), 2), np.nan), np.full((len(s.corner), 2), np.nan)
-    for i, c in enumerate(s.corner_px):
-        near = np.flatnonzero(np.abs(px - c).max(axis=1) < 1.6 * side)
-        near = near[:: max(1, len(near) // MAP_POINTS)]
-        fitted = _local(px[near] - c, uv[near]) if len(near) >= 16 else None
-        if fitted is not None:
-            out[i], sigma[i] = fitted
+    out, sigma = at_corners(s)
     ok = np.isfinite(out).all(axis=1)
     if not ok.any():
         return None
     keep = np.full(len(ok), True) if every else ok
     xy = np.ascontiguousarray(board.corner_mm(s.corner)[keep, :2])
     return Block(PHASE, camera, pose, number, np.ascontiguousarray(out[keep]), np.ascontiguousarray(sigma[keep]), xy)
+
+
+@lru_cache(maxsize=512)
+def at_corners(s: Sighting) -> tuple[F64, F64]:
+    """The projector's coordinate (n, 2) at a sighting's corners and its sigma; NaN where too few samples are around.
+
+    By a map of second order, fitted to the samples within a square and a half (after the local homographies of Moreno
+    and Taubin 2012, doi:10.1109/3DIMPVT.2012.77).
+    """
+    out, sigma = np.full((len(s.corner), 2), np.nan), np.full((len(s.corner), 2), np.nan)
+    b = sample_block(s, 0, 0, 0)
+    if b is None:
+        return out, sigma
+    rows, uv = projector_coordinates(b)
+    if len(rows) < 20:
+        return out, sigma
+    px = b.place[rows]
+    side = _square_px(s)
+    for i, c in enumerate(s.corner_px):
+        near = np.flatnonzero(np.abs(px - c).max(axis=1) < 1.6 * side)
+        near = near[:: max(1, len(near) // MAP_POINTS)]
+        fitted = _local(px[near] - c, uv[near]) if len(near) >= 16 else None
+        if fitted is not None:
+            out[i], sigma[i] = fitted
+    return out, sigma
 
 
 def _square_px(s: Sighting) -> float:

@@ -104,11 +104,11 @@ def board_trueness(grids: Sequence[Grid], sightings: Sequence[Sighting], board: 
     wanted = board.corner_mm(index)
     keep = np.ones(len(places), bool)
     for _ in range(3):
-        R, t, scale = _similarity(wanted[keep], places[keep])
-        rest = places - (wanted @ R.T + t)
+        T, scale = geometry.similarity(wanted[keep], places[keep])
+        rest = places - geometry.transform(T, wanted)
         size = np.linalg.norm(rest, axis=1)
         keep = size <= 5 * float(np.median(size)) + 1e-9
-    rest = rest[keep] @ R  # board coordinates
+    rest = rest[keep] @ T.R  # board coordinates
     spread = float(np.sqrt(((wanted[keep] - wanted[keep].mean(axis=0)) ** 2).sum()))
     rms = float(np.sqrt(np.mean(rest**2)))
     apart = [float(np.linalg.norm(np.array(v) - np.mean(v, axis=0), axis=1).mean()) * 2 for v in at.values() if v[1:]]
@@ -143,12 +143,3 @@ def _numbered(places: F64, index: I32, at: dict[tuple[int, int], list[F64]], boa
         if counts.max() > votes:
             best, votes = turned + shifts[np.argmax(counts)], int(counts.max())
     return best.astype(np.int32)
-
-
-def _similarity(a: F64, b: F64) -> tuple[F64, F64, float]:
-    """Rigid motion (R, t) with b = R a + t, and the scale that would fit best (Umeyama, doi 10.1109/34.88573)."""
-    ma, mb = a.mean(axis=0), b.mean(axis=0)
-    U, S, Vt = np.linalg.svd((b - mb).T @ (a - ma))
-    D = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ Vt)))])
-    R = U @ D @ Vt
-    return R, mb - R @ ma, float((S * np.diag(D)).sum() / ((a - ma) ** 2).sum())
