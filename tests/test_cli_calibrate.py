@@ -1,14 +1,18 @@
 """`fringescope calibrate` from folders to a rig and its report: what fails, what is left out by name, what repeats."""
 
 import json
+import resource
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from fringescope import calibrate, cli, report, store
+from fringescope import calibrate, cli, pipeline, report, store
+from fringescope.settings import Settings
 from fringescope.types import Board
 from tests.board_pictures import Scene, take
 
@@ -160,3 +164,40 @@ def test_patterns_for_a_board_need_no_rig(tmp_path, capsys) -> None:
     rig = tmp_path / "rig.json"
     assert cli.run(["patterns", str(rig), *line[1:]]) == 2
     assert "leave out" in capsys.readouterr().err
+
+
+def test_bands_of_rows_decode_to_the_same_as_the_whole(shared, monkeypatch) -> None:
+    capture = store.read_capture(shared / "data" / "rendered-small" / "calibration" / "pose03")
+    view = store.view_inputs(capture)[1]
+    whole, mean = pipeline.decode_bands(view, Settings())
+    monkeypatch.setattr(pipeline, "BAND", 684 * 70)
+    banded, same = pipeline.decode_bands(view, Settings())
+    np.testing.assert_array_equal(banded.reasons, whole.reasons)
+    np.testing.assert_array_equal(same, mean)
+    for a, b in zip(banded.directions, whole.directions, strict=True):
+        np.testing.assert_array_equal(a.phase, b.phase)
+        np.testing.assert_allclose(a.sigma, b.sigma, rtol=1e-6)
+    assert np.isfinite(whole.directions[0].phase).sum() > 50_000
+
+
+@pytest.mark.verify
+def test_pictures_of_20_megapixels_stay_below_3_gb(shared, tmp_path) -> None:
+    source = shared / "data" / "rendered-small" / "calibration"
+    folder = tmp_path / "session"
+    doc = json.loads((source / "pose03" / "capture.json").read_text())
+    doc["views"] = doc["views"][:1]
+    doc["views"][0] |= {"pixel_format": "Mono16"}
+    doc["views"][0].pop("color", None)
+    (folder / "pose03" / "camera1").mkdir(parents=True)
+    shutil.copy(source / "board.json", folder)
+    (folder / "pose03" / "capture.json").write_text(json.dumps(doc))
+    for one in doc["views"][0]["sets"]:
+        for name in one["frames"]:
+            raw = cv2.imread(str(source / "pose03" / name), cv2.IMREAD_UNCHANGED)
+            grey = cv2.demosaicing(raw, cv2.COLOR_BayerBG2GRAY).astype(np.uint16) * 257
+            large = cv2.resize(grey, (5472, 3648), interpolation=cv2.INTER_CUBIC)
+            cv2.imwrite(str(folder / "pose03" / name), large, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    command = [sys.executable, "-m", "fringescope", "calibrate", str(folder), "--out", str(tmp_path / "rig.json")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    assert "1 usable pose" in done.stderr  # it found the board, and asks for more
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 3e6  # kB

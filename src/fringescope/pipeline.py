@@ -77,7 +77,7 @@ def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
     return phase.with_reasons(decoded, reasons)
 
 
-BAND = 4_000_000  #: pixels of a board picture that are decoded at a time
+BAND = 1_000_000  #: pixels of a board picture that are decoded at a time
 SIMPLE = 2_000_000  #: pixels that suffice to estimate the noise
 
 
@@ -106,16 +106,18 @@ def decode_bands(view: ViewInput, s: Settings) -> tuple[Decoded, F32]:
     rows = max(64, BAND // W // 2 * 2)
     noise = view.noise or (_noise_of_rows(view.plan, frames, s) if rows < H else None)  # one band tells its own
     overlap = 2 * 4 * (s.phase.order_votes // 2)
-    parts: list[Decoded] = []
+    whole: Decoded | None = None
     for row in range(0, H, rows):
         top, end = max(row - overlap, 0), min(row + rows, H)
         below = min(end + overlap, H)
         band = [(key, np.ascontiguousarray(f[top:below])) for key, f in frames]
         measured = measured_view(replace(view, frames=band, noise=noise), s)
         decoded = phase.settle_order(measured, view.plan, s.phase)
-        reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)
-        parts.append(phase.crop_rows(phase.with_reasons(decoded, reasons), row - top, end - top))
-    return phase.join_rows(parts), phase.mean_picture(frames, view.plan)
+        decoded = phase.with_reasons(decoded, denoise.exposed(decoded, view.plan.pixel_format, s.denoise))
+        whole = whole or phase.room_for(decoded, H)
+        phase.put_rows(whole, decoded, row - top, end - top, row)
+    assert whole is not None  # a picture has rows
+    return whole, phase.mean_picture(frames, view.plan)
 
 
 def _noise_of_rows(plan: ViewPlan, frames: Sequence[tuple[FrameKey, AnyArray]], s: Settings) -> NoiseModel:

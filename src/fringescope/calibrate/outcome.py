@@ -279,7 +279,7 @@ def read_at_corners(
     ok = np.isfinite(out).all(axis=1)
     if not ok.any():
         return None
-    keep = np.full(len(ok), True) if every else ok
+    keep = np.full(len(out), True) if every else ok
     xy = np.ascontiguousarray(board.corner_mm(s.corner)[keep, :2])
     return Block(PHASE, camera, pose, number, np.ascontiguousarray(out[keep]), np.ascontiguousarray(sigma[keep]), xy)
 

@@ -4,7 +4,7 @@ Captures may hold any direction, any number of steps, HDR brackets and Gray code
 sites: the phase does not depend on a site's colour, so no demosaicing ever mixes pixels.
 """
 
-from fringescope.phase.measure import crop_rows, join_rows, measure, with_reasons
+from fringescope.phase.measure import measure, put_rows, room_for, with_reasons
 from fringescope.phase.noise import estimate_noise
 from fringescope.phase.order import families, field_bounds, projector_coordinates, settle_order, unambiguous_span
 from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, mean_picture
@@ -13,15 +13,15 @@ __all__ = [
     "FringeSums",
     "GrayBits",
     "Measured",
-    "crop_rows",
     "estimate_noise",
     "families",
     "field_bounds",
     "intensity",
-    "join_rows",
     "mean_picture",
     "measure",
     "projector_coordinates",
+    "put_rows",
+    "room_for",
     "settle_order",
     "unambiguous_span",
     "with_reasons",

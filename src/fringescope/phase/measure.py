@@ -118,29 +118,22 @@ def with_reasons(decoded: Decoded, reasons: U16) -> Decoded:
     return replace(decoded, reasons=reasons)
 
 
-def crop_rows(decoded: Decoded, first: int, last: int) -> Decoded:
-    """Rows first to last - 1 of a decoded view, without its wrapped sets and codes."""
-
-    def crop(a: AnyArray) -> AnyArray:
-        return a[first:last].copy()
-
-    directions = tuple(replace(d, phase=crop(d.phase), sigma=crop(d.sigma), order_margin=crop(d.order_margin))
-                       for d in decoded.directions)  # fmt: skip
-    A, B, reasons = crop(decoded.background), crop(decoded.modulation), crop(decoded.reasons)
-    return replace(decoded, directions=directions, sets=(), gray=(), background=A, modulation=B, reasons=reasons)
-
-
-def join_rows(parts: Sequence[Decoded]) -> Decoded:
-    """One decoded view of several, one below the other (see `crop_rows`)."""
-
-    def join(arrays: Sequence[AnyArray]) -> AnyArray:
-        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
-
+def room_for(part: Decoded, height: int) -> Decoded:
+    """Room for a view of `height` rows of which `part` is a band: uninitialised; no wrapped sets, codes or margins."""
+    shape = (height, part.shape[1])
+    none = np.broadcast_to(np.float32(np.nan), shape)
     directions = tuple(
-        replace(same[0], **{n: join([getattr(d, n) for d in same]) for n in ("phase", "sigma", "order_margin")})
-        for same in zip(*(p.directions for p in parts), strict=True)
+        replace(d, phase=np.empty(shape, np.float32), sigma=np.empty(shape, np.float32), order_margin=none)
+        for d in part.directions
     )
-    A, B = join([p.background for p in parts]), join([p.modulation for p in parts])
-    return replace(
-        parts[0], directions=directions, background=A, modulation=B, reasons=join([p.reasons for p in parts])
-    )
+    A, B, reasons = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint16)
+    return replace(part, directions=directions, sets=(), gray=(), background=A, modulation=B, reasons=reasons)
+
+
+def put_rows(whole: Decoded, part: Decoded, first: int, last: int, row: int) -> None:
+    """Copies rows first to last - 1 of a band into `whole` (see `room_for`), where they begin at `row`."""
+    to, rows = slice(row, row + last - first), slice(first, last)
+    for d, e in zip(whole.directions, part.directions, strict=True):
+        d.phase[to], d.sigma[to] = e.phase[rows], e.sigma[rows]
+    whole.background[to], whole.modulation[to] = part.background[rows], part.modulation[rows]
+    whole.reasons[to] = part.reasons[rows]
