@@ -181,6 +181,25 @@ def test_highlights_come_from_the_views_that_do_not_have_them(flat):
     assert np.median(de2000(lab(fused.pictures[0][rim & ~spot & ok]), lab(expected[rim & ~spot & ok]))) < 4.0
 
 
+def test_pixels_without_a_point_in_a_highlight_are_no_specks(flat):
+    r, _, grids, photos, _ = flat
+    g = grids[0]
+    H, W = g.sigma.shape
+    v, u = np.mgrid[:H, :W]
+    spot = (u - 80) ** 2 + (v - 60) ** 2 < 15**2
+    holes = spot & (u % 5 == 0) & (v % 4 == 0)
+    rgb = photos[0].rgb + np.where(spot, 0.5, 0.0).astype(np.float32)[..., None]
+    xyz, sigma, reasons = g.xyz.copy(), g.sigma.copy(), g.reasons.copy()
+    xyz[holes], sigma[holes], reasons[holes] = np.nan, np.nan, 2
+    torn = Grid(g.view, g.camera, xyz, sigma, reasons)
+    glossy = Photo(photos[0].camera, rgb, spot)
+    fused = fuse.merge([torn, *grids[1:]], [glossy, *photos[1:]], r, FuseSettings(harmonise=False))
+    expected = fuse.encode_srgb(scenes.paint(g.xyz.astype(float)))
+    where = holes & g.valid
+    assert where.sum() > 20
+    assert de2000(lab(fused.pictures[0][where]), lab(expected[where])).max() < 4.0
+
+
 def test_a_grey_picture_takes_no_colour_away(flat):
     r, _, grids, photos, _ = flat
     grey = Photo(photos[0].camera, np.repeat(photos[0].rgb.mean(2, keepdims=True), 3, 2), photos[0].saturated)

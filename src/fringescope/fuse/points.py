@@ -17,6 +17,7 @@ from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Cloud, Grid, Photo, Rig
 
 _SMOOTH = (15, 15)  # cells over which a view's weight is averaged before ownership is settled
+_GAP = (7, 7)  # pixels around a gap in the blending that tell what blending does there
 _BAND = 256  # rows worked on at a time, which bounds the memory of the sums
 
 
@@ -170,6 +171,7 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
             k.settle(v.grid.xyz, v.normal, v.sigma_n, v.weight, v.centre, row0, row1, shift, total, variance, facing,
                      xyz, n, sigma)
             k.blend(samples, s.gloss, row0, v.rgb, v.colour_weight, colour)
+        _even(colour, v.rgb, seen != 0)
         seen[np.isfinite(v.sigma_n)] |= np.uint8(1 << a)
         fused.append(Grid(v.grid.view, v.grid.camera, xyz, sigma, v.grid.reasons))
         ns.append(n)
@@ -178,6 +180,20 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     own = _ownership(fused, ns, [v.weight for v in views], [v.spacing for v in views], rig, s)
     return Fused(tuple(fused), tuple(ns), tuple(pictures), tuple(own), tuple(seen_all),
                  tuple(v.spacing for v in views), gains)
+
+
+def _even(colour: F32, own: F32, blended: Bool) -> None:
+    """Carry what blending did to a picture into its gaps: pixels where no other view sees the place, but around which
+    others do, as single pixels without a point in a highlight. They get their own colour times the ratio of blended to
+    own colour around them.
+    """
+    if blended.all() or not blended.any():
+        return
+    there = blended.astype(np.float32)
+    share = cv2.blur(there, _GAP)
+    after, before = (cv2.blur(c * there[..., None], _GAP) for c in (colour, own))
+    gap = ~blended & (share > 0.3)
+    colour[gap] = own[gap] * np.clip(after[gap] / np.maximum(before[gap], 1e-6), 0.0, 4.0)
 
 
 def _ownership(grids: Sequence[Grid], ns: Sequence[F32], weights: Sequence[F32], spacings: Sequence[float], rig: Rig,
