@@ -52,7 +52,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "store": (DATA, "files know data, not algorithms"),
     "importing": (DATA | {"store"}, "other people's images become one of our captures"),
     "export": (DATA, "files know data, not algorithms"),
-    "pipeline": (BOTTOM | STAGES | {"capture"}, "all ordering lives here: objects in, objects out; no files"),
+    "pipeline": (BOTTOM | STAGES | {"capture", "threads"}, "all ordering lives here: objects, no files"),
     "server": (ANYTHING, "the rim: nobody imports it"),
     "warmup": (ANYTHING, "a tiny scan from end to end, for the command line alone"),
     "cli": (ANYTHING, "the rim: nobody imports it"),

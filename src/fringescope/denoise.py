@@ -7,6 +7,7 @@ move one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -42,30 +43,34 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
     too.
     """
     out = decoded.reasons.copy()
-    scale = pixel_format.full_scale / 255.0
     A, B = decoded.background, decoded.modulation
     if not decoded.sets:  # Gray code alone: background and modulation are the contrast of the bits
-        out[s.min_modulation * scale > B] |= np.uint16(Reason.LOW_MODULATION)
+        out[s.min_modulation * pixel_format.full_scale / 255.0 > B] |= np.uint16(Reason.LOW_MODULATION)
         return out
-    noise = np.sqrt(decoded.noise.variance(A))
-    dark = s.min_background * scale > A
-    low = (s.min_modulation * scale > B) | (s.min_contrast * A > B) | (s.min_modulation_sigma * noise > B)
+    dark, low = weak(decoded, pixel_format, s)
     out[dark] |= np.uint16(Reason.DARK)
     out[low] |= np.uint16(Reason.LOW_MODULATION)
+    every = odd_stride(A.size)
+    cut = (slice(None, None, every), slice(None, None, every))
     for d in decoded.directions:
         family = [w for w in decoded.sets if abs(d.g[0] * w.g[1] - d.g[1] * w.g[0]) < 1e-4 * _norm(d.g) * _norm(w.g)]
         family.sort(key=lambda w: _norm(w.g))
         if not family:
             continue
-        clipped = (family[-1].saturated > 0) & ~np.isfinite(d.sigma)
+        fine = family[-1]
+        clipped = (fine.saturated > 0) & ~np.isfinite(d.sigma)
         out[clipped] |= np.uint16(Reason.SATURATED)
         out[clipped] &= ~np.uint16(Reason.LOW_MODULATION | Reason.ORDER_UNCERTAIN)
-        ok = out == 0
-        if ok.any():
-            limit = max(s.max_sigma_rad, s.max_sigma_factor * float(np.median(d.sigma[ok])))
-            out[ok & (d.sigma > limit)] |= np.uint16(Reason.LOW_MODULATION)
+        ok = (out | np.uint16(Reason.ORDER_UNCERTAIN)) == Reason.ORDER_UNCERTAIN
+        limit, contrast = usual_exposure(family, ~(dark | low), s, cut)
+        out[ok & (d.sigma > limit)] |= np.uint16(Reason.LOW_MODULATION)
         if len(family) > 1:
-            out[ok & _fine_contrast_lost(family[-2], family[-1], ok, s)] |= np.uint16(Reason.LOW_MODULATION)
+            coarse = family[-2]
+            around = (_between(A.shape[0], 8) @ contrast @ _between(A.shape[1], 8).T).astype(np.float32)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = fine.modulation / coarse.modulation * (1 + 2.0 * fine.sigma)  # sigma of B / B is the phase's
+            whole = ok & (coarse.saturated == 0) & (fine.saturated == 0)
+            out[whole & (ratio < s.min_fine_modulation * around)] |= np.uint16(Reason.LOW_MODULATION)
     out[dark] &= ~np.uint16(Reason.ORDER_UNCERTAIN | Reason.INCONSISTENT)
     out[(out & Reason.LOW_MODULATION) != 0] &= ~np.uint16(Reason.ORDER_UNCERTAIN)
     return out
@@ -75,24 +80,55 @@ def _norm(g: tuple[float, float]) -> float:
     return float(np.hypot(*g))
 
 
-def _fine_contrast_lost(coarse: WrappedSet, fine: WrappedSet, ok: Bool, s: DenoiseSettings) -> Bool:
-    """Where B(fine) / B(coarse) falls below `min_fine_modulation` of its median around (tiles of an eighth)."""
+def weak(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> tuple[Bool, Bool]:
+    """Which pixels (H, W) are dark, and which are modulated too little by their brightness and noise."""
+    scale = pixel_format.full_scale / 255.0
+    A, B = decoded.background, decoded.modulation
+    noise = np.sqrt(decoded.noise.variance(A))
+    low = (s.min_modulation * scale > B) | (s.min_contrast * A > B) | (s.min_modulation_sigma * noise > B)
+    return np.asarray(s.min_background * scale > A), np.asarray(low)
+
+
+def odd_stride(pixels: int, enough: int = 100_000) -> int:
+    """Every how many-th row and column is enough for a median: odd, so that every colour of a mosaic comes in."""
+    return round(math.sqrt(pixels / enough)) | 1
+
+
+def usual_exposure(
+    family: Sequence[WrappedSet], ok: Bool, s: DenoiseSettings, cut: tuple[slice, slice] = (slice(None), slice(None))
+) -> tuple[float, F64]:
+    """What is usual in a view, from its well exposed pixels `ok`: the largest sigma of a useful phase, radians, and the
+    modulation of the finest of the parallel sets `family` over that of the next coarser one.
+
+    The latter as (8, 8) nodes that span the picture corner on corner: medians of tiles, smoothed. `cut` thins.
+    """
+    fine = family[-1]
+    ok = ok[cut] & (fine.saturated[cut] == 0)
+    sigma = fine.sigma[cut][ok]
+    limit = max(s.max_sigma_rad, s.max_sigma_factor * float(np.median(sigma))) if sigma.size else np.inf
+    usual = np.ones((8, 8), np.float32)
+    if len(family) == 1:
+        return limit, usual.astype(np.float64)
+    coarse = family[-2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        whole = ok & (coarse.saturated == 0) & (fine.saturated == 0)
-        ratio = np.where(whole, fine.modulation / coarse.modulation, np.nan)
+        ratio = np.where(ok & (coarse.saturated[cut] == 0), fine.modulation[cut] / coarse.modulation[cut], np.nan)
     if not np.isfinite(ratio).any():
-        return np.zeros(ok.shape, np.bool_)
-    H, W = ok.shape
-    usual = np.full((8, 8), np.nanmedian(ratio), np.float32)
+        return limit, np.zeros((8, 8))
+    H, W = ratio.shape
+    usual[:] = np.nanmedian(ratio)
     for a in range(8):
         for b in range(8):
             tile = ratio[a * H // 8 : (a + 1) * H // 8, b * W // 8 : (b + 1) * W // 8]
             tile = tile[np.isfinite(tile)]
             if tile.size > max(16, H * W // 640):
                 usual[a, b] = np.median(tile)
-    around = cv2.resize(cv2.blur(usual, (3, 3)), (W, H), interpolation=cv2.INTER_LINEAR)
-    allowance = 2.0 * fine.sigma  # sigma of B over B is that of the phase
-    return np.asarray(ratio * (1 + allowance) < s.min_fine_modulation * around)
+    return limit, np.asarray(cv2.blur(usual, (3, 3)), np.float64)
+
+
+def _between(length: int, nodes: int) -> F64:
+    """Weights (length, nodes) of linear interpolation between nodes that span a side of `length` pixels end to end."""
+    at = np.arange(length) * (nodes - 1) / max(length - 1, 1)
+    return np.asarray(np.clip(1.0 - np.abs(at[:, None] - np.arange(nodes)), 0.0, None))
 
 
 def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings) -> U16:

@@ -50,3 +50,14 @@ def by_rows(count: Callable[..., int]) -> Callable[[Callable[..., None]], Callab
         return call
 
     return decorate
+
+
+def in_bands(height: int, rows: int, work: Callable[[int, int], None]) -> None:
+    """Call `work(first, last)` for bands of `rows` rows of `height`, on all cores; the first error is raised."""
+    bands = [(row, min(row + rows, height)) for row in range(0, height, rows)]
+    if len(bands) == 1 or WORKERS == 1:
+        for first, last in bands:
+            work(first, last)
+        return
+    for task in [_pool(os.getpid()).submit(work, first, last) for first, last in bands]:
+        task.result()

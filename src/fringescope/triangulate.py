@@ -55,33 +55,20 @@ def grid(
     lost = (reasons == 0) & ~np.isfinite(sigma_mm)
     out[lost] |= np.uint16(Reason.OUT_OF_VOLUME)
     out[(reasons == 0) & (miss > max_miss)] |= np.uint16(Reason.ORDER_UNCERTAIN)
-    _outside(rig, decoded.camera, xyz, out, volume_margin)
+    field, box = geometry.lit_field(rig, camera), geometry.measuring_box(rig, camera, volume_margin)
+    bit = np.uint16(Reason.OUT_OF_VOLUME)
+    rays.mark_outside(
+        xyz, projector.pose.R, projector.pose.t, geometry.lens_vector(projector.lens), *field, *box, out, bit
+    )
     bad = out != 0
     xyz[bad] = np.nan
     sigma_mm[bad] = np.nan
     return Grid(rig.index(decoded.camera), decoded.camera, xyz, sigma_mm, out)
 
 
-def _outside(rig: Rig, name: str, xyz: F32, reasons: U16, margin: float) -> None:
-    """Mark points outside the measuring space and on the rim of the projector's field.
-
-    A camera pixel that straddles the rim saw half a fringe: half its footprint, in projector units, is the margin.
-    """
-    camera, projector = rig.camera(name), rig.projector
-    some = xyz[::7, ::7][np.isfinite(xyz[::7, ::7, 2])]
-    if not len(some):
-        some = np.array([rig.volume.center if rig.volume else geometry.working_point(rig)], dtype=np.float32)
-    z_camera = float(np.median(geometry.transform(camera.pose, some)[:, 2]))
-    z_projector = float(np.median(geometry.transform(projector.pose, some)[:, 2]))
-    footprint = z_camera / camera.lens.K[0, 0]
-    units_per_mm = np.array([projector.lens.K[0, 0], projector.lens.K[1, 1]]) / z_projector
-    rim = np.maximum(0.5 * footprint * units_per_mm, 0.5)
-    high = np.array(projector.plane_size) - 1 - rim
-    if rig.volume is not None:
-        box = rig.volume.center, rig.volume.axes, rig.volume.half_size * margin
-    else:  # the slab of depths that all devices share: see `geometry.measuring_space`
-        near, far = geometry.common_depths(rig, camera)
-        middle = geometry.transform(geometry.inverse(camera.pose), [0.0, 0.0, (near + far) / 2])
-        box = middle, camera.pose.R, np.array([np.inf, np.inf, (far - near) / 2])
-    lens, bit = geometry.lens_vector(projector.lens), np.uint16(Reason.OUT_OF_VOLUME)
-    rays.mark_outside(xyz, projector.pose.R, projector.pose.t, lens, rim, high, *box, reasons, bit)
+def blanked(xyz: F32, sigma: F32, reasons: U16, rig: Rig, camera: str) -> Grid:
+    """Points (H, W, 3) and sigma (H, W) that were made of all pixels, without those that have a reason (in place)."""
+    bad = reasons != 0
+    xyz[bad] = np.nan
+    sigma[bad] = np.nan
+    return Grid(rig.index(camera), camera, xyz, sigma, reasons)

@@ -8,10 +8,8 @@ import math
 import numpy as np
 from numba import njit
 
+from fringescope.kernels.sinusoid import ROUNDING, TWO_PI, follow, left_over, phase_variance, turns
 from fringescope.threads import by_rows
-
-TWO_PI = 2.0 * math.pi
-ROUNDING = 1.0 / 12.0  #: least variance of a sample, codes squared
 
 
 @by_rows(lambda frame, *_: frame.shape[0])
@@ -52,6 +50,49 @@ def normal_matrix(clipped, steps):
     return m00, m01, m02, m11, m12, m22
 
 
+@njit(cache=True, error_model="numpy")
+def clipped_sinusoid(clipped, steps, total, in_phase, quadrature):
+    """The sinusoid A + c cos + s sin of the samples that are not clipped: is there one, A, c, s, samples left."""
+    m00, m01, m02, m11, m12, m22 = normal_matrix(clipped, steps)
+    c00 = m11 * m22 - m12 * m12
+    c01 = m02 * m12 - m01 * m22
+    c02 = m01 * m12 - m02 * m11
+    det = m00 * c00 + m01 * c01 + m02 * c02
+    if m00 < 3.0 or det < 1e-9:
+        return False, total / m00 if m00 > 0.0 else np.inf, 0.0, 0.0, m00
+    c11 = m00 * m22 - m02 * m02
+    c12 = m01 * m02 - m00 * m12
+    c22 = m00 * m11 - m01 * m01
+    a = (c00 * total + c01 * in_phase + c02 * quadrature) / det
+    c = (c01 * total + c11 * in_phase + c12 * quadrature) / det
+    s = (c02 * total + c12 * in_phase + c22 * quadrature) / det
+    return True, a, c, s, m00
+
+
+@njit(cache=True, error_model="numpy")
+def clipped_gain(clipped, steps, phase):
+    """What takes the place of 2 / N in the phase's variance where samples are clipped; infinite if too many are."""
+    m00, m01, m02, m11, m12, m22 = normal_matrix(clipped, steps)
+    det = m00 * (m11 * m22 - m12 * m12) + m01 * (m02 * m12 - m01 * m22) + m02 * (m01 * m12 - m02 * m11)
+    if det < 1e-9:
+        return np.inf
+    jc, js = -math.sin(phase), math.cos(phase)
+    c11 = m00 * m22 - m02 * m02
+    c12 = m01 * m02 - m00 * m12
+    c22 = m00 * m11 - m01 * m01
+    return (jc * jc * c11 + 2.0 * jc * js * c12 + js * js * c22) / det
+
+
+@njit(cache=True, error_model="numpy")
+def count_clipped(clipped):
+    """Bits that are set."""
+    n = 0
+    while clipped != np.uint64(0):
+        clipped &= clipped - np.uint64(1)
+        n += 1
+    return n
+
+
 @by_rows(lambda total, *_: total.shape[0])
 def wrap(first, last, total, in_phase, quadrature, squares, clipped, steps, phase, background, modulation, variance):
     """Sums to the least-squares sinusoid of the samples that are left: wrapped phase in (-pi, pi], A and B.
@@ -68,29 +109,18 @@ def wrap(first, last, total, in_phase, quadrature, squares, clipped, steps, phas
                 c = 2.0 * p / steps
                 s = 2.0 * q / steps
             else:
-                m00, m01, m02, m11, m12, m22 = normal_matrix(clipped[i, j], steps)
-                left = m00
-                c00 = m11 * m22 - m12 * m12
-                c01 = m02 * m12 - m01 * m22
-                c02 = m01 * m12 - m02 * m11
-                det = m00 * c00 + m01 * c01 + m02 * c02
-                if left < 3.0 or det < 1e-9:
+                ok, a, c, s, left = clipped_sinusoid(clipped[i, j], steps, t, p, q)
+                if not ok:
                     phase[i, j] = 0.0
-                    background[i, j] = t / left if left > 0.0 else np.inf
+                    background[i, j] = a
                     modulation[i, j] = 0.0
                     variance[i, j] = np.nan
                     continue
-                c11 = m00 * m22 - m02 * m02
-                c12 = m01 * m02 - m00 * m12
-                c22 = m00 * m11 - m01 * m01
-                a = (c00 * t + c01 * p + c02 * q) / det
-                c = (c01 * t + c11 * p + c12 * q) / det
-                s = (c02 * t + c12 * p + c22 * q) / det
-            phase[i, j] = math.atan2(s, c)
+            phase[i, j] = TWO_PI * turns(s, c)
             background[i, j] = a
             modulation[i, j] = math.sqrt(c * c + s * s)
             if left > 3.0:
-                variance[i, j] = max(squares[i, j] - a * t - c * p - s * q, 0.0) / (left - 3.0)
+                variance[i, j] = left_over(squares[i, j], t, p, q, a, c, s, 1.0 / (left - 3.0))
             else:
                 variance[i, j] = np.nan
 
@@ -99,31 +129,23 @@ def wrap(first, last, total, in_phase, quadrature, squares, clipped, steps, phas
 def phase_sigma(first, last, phase, background, modulation, clipped, steps, a, b, max_clipped, out, lost):
     """Standard deviation of the wrapped phase for sample variance a + b I: sqrt(2 (a + b A) / N) / B for N > 3.
 
-    Three steps have a further term, -(b B / 2) cos 3 phi; with clipped samples the inverse normal matrix of the rest
+    Three steps have a further term (see `phase_variance`); with clipped samples the inverse normal matrix of the rest
     takes the place of 2 / N. Infinite where B is 0 or more than `max_clipped` samples are clipped. `lost` counts them.
     """
     for i in range(first, last):
         for j in range(phase.shape[1]):
             B = modulation[i, j]
-            v = a + b * background[i, j]
+            v = max(a + b * background[i, j], ROUNDING)
             gain = 2.0 / steps
             lost[i, j] = 0
-            if clipped[i, j] != np.uint64(0):
-                m00, m01, m02, m11, m12, m22 = normal_matrix(clipped[i, j], steps)
-                lost[i, j] = steps - int(m00)
-                det = m00 * (m11 * m22 - m12 * m12) + m01 * (m02 * m12 - m01 * m22) + m02 * (m01 * m12 - m02 * m11)
-                if lost[i, j] > max_clipped or det < 1e-9:
-                    out[i, j] = np.inf
-                    continue
-                jc = -math.sin(phase[i, j])
-                js = math.cos(phase[i, j])
-                c11 = m00 * m22 - m02 * m02
-                c12 = m01 * m02 - m00 * m12
-                c22 = m00 * m11 - m01 * m01
-                gain = (jc * jc * c11 + 2.0 * jc * js * c12 + js * js * c22) / det
-            elif steps == 3:
-                v -= 0.5 * b * B * math.cos(3.0 * phase[i, j])
-            out[i, j] = math.sqrt(gain * max(v, ROUNDING)) / B if B > 0.0 else np.inf
+            whole = clipped[i, j] == np.uint64(0)
+            if not whole:
+                lost[i, j] = count_clipped(clipped[i, j])
+                gain = clipped_gain(clipped[i, j], steps, phase[i, j]) if lost[i, j] <= max_clipped else np.inf
+            three = 3 if whole and steps == 3 else 4
+            cos_phase = math.cos(phase[i, j]) if three == 3 else 1.0
+            variance = phase_variance(v, b, float(B), cos_phase, gain, three) if B > 0.0 else np.inf
+            out[i, j] = math.sqrt(max(variance, 0.0))
 
 
 @by_rows(lambda phase, *_: phase.shape[1])
@@ -155,30 +177,63 @@ def merge_brackets(first, last, phase, background, modulation, sigma, out):
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _chain(phases, sigmas, freq, i, j, first, order):
-    """Follow the sets from coarse to fine from an order of set `first`: absolute phase of the finest and chi squared.
+    """Follow the sets from coarse to fine from an order of set `first`: absolute turns of the finest and chi squared.
 
-    Sets of infinite sigma are passed over. The third value is the margin of the closest rounding on the way: how many
-    standard deviations the next order of that set would fit worse.
+    Sets of infinite sigma are passed over. The third value is the margin of the closest rounding on the way, squared:
+    how many standard deviations the next order of that set would fit worse.
     """
-    absolute = phases[first, i, j] + TWO_PI * order
-    sigma = sigmas[first, i, j]
+    absolute = phases[first, i, j] / TWO_PI + order
+    sigma = sigmas[first, i, j] / TWO_PI
     last = first
     chi2 = 0.0
     margin2 = np.inf
     for k in range(first + 1, phases.shape[0]):
         if not sigmas[k, i, j] < np.inf:
             continue
-        ratio = freq[k] / freq[last]
-        predicted = absolute * ratio
-        turns = math.floor((predicted - phases[k, i, j]) / TWO_PI + 0.5)
-        rest = predicted - phases[k, i, j] - TWO_PI * turns
-        var = (sigma * ratio) ** 2 + sigmas[k, i, j] ** 2
-        chi2 += rest * rest / var
-        margin2 = min(margin2, TWO_PI * (TWO_PI - 2.0 * abs(rest)) / var)
-        absolute = phases[k, i, j] + TWO_PI * turns
-        sigma = sigmas[k, i, j]
+        fine = sigmas[k, i, j] / TWO_PI
+        absolute, rest, margin = follow(absolute, sigma, phases[k, i, j] / TWO_PI, fine, freq[k] / freq[last])
+        chi2 += rest
+        margin2 = min(margin2, margin)
+        sigma = fine
         last = k
     return absolute, chi2, margin2
+
+
+@njit(cache=True, error_model="numpy")
+def best_order(phases, sigmas, freq, i, j, lo, hi, soft_lo, soft_hi, unexpected, middle, half, soft):
+    """The order of pixel (i, j) of K parallel sets that fits best: absolute phase of the finest and its margin.
+
+    See `unwrap`; `middle` is the pixel's Gray code (NaN = no opinion), the bounds are the pixel's own.
+    """
+    K = phases.shape[0]
+    best = np.nan
+    best_chi2 = second_chi2 = best_margin2 = np.inf
+    if middle == middle:
+        lo = max(lo, middle - 2.0 * half)
+        hi = min(hi, middle + 2.0 * half)
+    coarsest = 0
+    while coarsest < K - 1 and not sigmas[coarsest, i, j] < np.inf:
+        coarsest += 1
+    if lo <= hi and sigmas[K - 1, i, j] < np.inf:
+        up = freq[K - 1] / freq[coarsest]
+        first = math.floor((lo / up - phases[coarsest, i, j]) / TWO_PI)
+        last = math.ceil((hi / up - phases[coarsest, i, j]) / TWO_PI)
+        for order in range(int(first), int(last) + 1):
+            absolute, chi2, rounding2 = _chain(phases, sigmas, freq, i, j, coarsest, order)
+            absolute *= TWO_PI
+            if absolute < lo or absolute > hi:
+                continue
+            if absolute < soft_lo or absolute > soft_hi:
+                chi2 += unexpected
+            if middle == middle:
+                off = max(abs(absolute - middle) - half, 0.0) / soft
+                chi2 += off * off
+            if chi2 < best_chi2:
+                second_chi2 = best_chi2
+                best, best_chi2, best_margin2 = absolute, chi2, rounding2
+            elif chi2 < second_chi2:
+                second_chi2 = chi2
+    return best, min(math.sqrt(max(min(second_chi2 - best_chi2, best_margin2), 0.0)), 99.0)
 
 
 @by_rows(lambda phases, *_: phases.shape[1])
@@ -196,7 +251,6 @@ def unwrap(first, last, phases, sigmas, freq, bounds, unexpected, gray, gray_hal
     """
     H, W = phases.shape[1], phases.shape[2]
     h, w = bounds.shape[1], bounds.shape[2]
-    K = phases.shape[0]
     use_gray = gray.shape[0] == H
     for i in range(first, last):
         y = i * (h - 1) / max(H - 1, 1)
@@ -216,38 +270,10 @@ def unwrap(first, last, phases, sigmas, freq, bounds, unexpected, gray, gray_hal
             hi = w00 * bounds[1, y0, x0] + w01 * bounds[1, y0, x1] + w10 * bounds[1, y1, x0] + w11 * bounds[1, y1, x1]
             elo = w00 * bounds[2, y0, x0] + w01 * bounds[2, y0, x1] + w10 * bounds[2, y1, x0] + w11 * bounds[2, y1, x1]
             ehi = w00 * bounds[3, y0, x0] + w01 * bounds[3, y0, x1] + w10 * bounds[3, y1, x0] + w11 * bounds[3, y1, x1]
-            best = np.nan
-            best_chi2 = second_chi2 = np.inf
-            best_margin2 = np.inf
-            middle = np.nan
-            if use_gray:
-                middle = gray[i, j]
-                if middle == middle:
-                    lo = max(lo, middle - 2.0 * gray_half)
-                    hi = min(hi, middle + 2.0 * gray_half)
-            coarsest = 0
-            while coarsest < K - 1 and not sigmas[coarsest, i, j] < np.inf:
-                coarsest += 1
-            if lo <= hi and sigmas[K - 1, i, j] < np.inf:
-                up = freq[K - 1] / freq[coarsest]
-                first = math.floor((lo / up - phases[coarsest, i, j]) / TWO_PI)
-                last = math.ceil((hi / up - phases[coarsest, i, j]) / TWO_PI)
-                for order in range(int(first), int(last) + 1):
-                    absolute, chi2, rounding2 = _chain(phases, sigmas, freq, i, j, coarsest, order)
-                    if absolute < lo or absolute > hi:
-                        continue
-                    if absolute < elo or absolute > ehi:
-                        chi2 += unexpected
-                    if middle == middle:
-                        off = max(abs(absolute - middle) - gray_half, 0.0) / gray_soft
-                        chi2 += off * off
-                    if chi2 < best_chi2:
-                        second_chi2 = best_chi2
-                        best, best_chi2, best_margin2 = absolute, chi2, rounding2
-                    elif chi2 < second_chi2:
-                        second_chi2 = chi2
-            out[i, j] = best
-            margin[i, j] = min(math.sqrt(max(min(second_chi2 - best_chi2, best_margin2), 0.0)), 99.0)
+            middle = gray[i, j] if use_gray else np.nan
+            out[i, j], margin[i, j] = best_order(
+                phases, sigmas, freq, i, j, lo, hi, elo, ehi, unexpected, middle, gray_half, gray_soft
+            )
 
 
 @by_rows(lambda phase, *_: phase.shape[0])

@@ -13,12 +13,13 @@ from fringescope.threads import by_rows
 
 @njit(cache=True, inline="always", error_model="numpy")
 def distort(x, y, lens):
-    """Ideal normalised coordinates to distorted ones."""
+    """Ideal normalised coordinates to distorted ones, in the precision of what it gets (no number is written out)."""
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    radial = r2 * (k1 + r2 * (k2 + r2 * k3))
+    xd = x + (x * radial + (p1 + p1) * xy + p2 * (r2 + xx + xx))
+    yd = y + (y * radial + p1 * (r2 + yy + yy) + (p2 + p2) * xy)
     return xd, yd
 
 

@@ -6,13 +6,24 @@ sites: the phase does not depend on a site's colour, so no demosaicing ever mixe
 
 from fringescope.phase.measure import measure, put_rows, room_for, with_reasons
 from fringescope.phase.noise import estimate_noise
-from fringescope.phase.order import families, field_bounds, projector_coordinates, settle_order, unambiguous_span
+from fringescope.phase.order import (
+    PARALLEL_RAD,
+    check_repeats,
+    families,
+    field_bounds,
+    projector_coordinates,
+    settle_order,
+    unambiguous_span,
+    vote_on_orders,
+)
 from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, mean_picture
 
 __all__ = [
+    "PARALLEL_RAD",
     "FringeSums",
     "GrayBits",
     "Measured",
+    "check_repeats",
     "estimate_noise",
     "families",
     "field_bounds",
@@ -24,5 +35,6 @@ __all__ = [
     "room_for",
     "settle_order",
     "unambiguous_span",
+    "vote_on_orders",
     "with_reasons",
 ]

@@ -103,14 +103,8 @@ def settle_order(
                 )
         else:
             bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
-            span = unambiguous_span(group, 4 * s.systematic_rad)
-            room = float(np.median(bounds[3] - bounds[2])) / (2 * math.pi * math.hypot(*g))
-            if gray is None and room > MOST_REPEATS * span:
-                raise DecodeError(
-                    f"view '{plan.camera}': the sets along ({g[0]:.4g}, {g[1]:.4g}) repeat after {span:.0f} projector "
-                    f"units, a ray crosses {room:.0f} in the measuring space; add a coarser period or a Gray code, or "
-                    f"give the rig a smaller volume"
-                )
+            if gray is None:
+                _check_repeats(group, bounds, plan.camera, s)
         direction, bad = _unwrap(group, bounds, gray, half, soft, s)
         if rig is not None:  # no order leads into the measuring space
             lost = ~np.isfinite(direction.phase) & np.isfinite(direction.sigma)
@@ -123,6 +117,46 @@ def settle_order(
             out.append(direction)
             reasons |= bad
     return replace(decoded, directions=tuple(out), reasons=reasons)
+
+
+def check_repeats(decoded: Decoded, plan: ViewPlan, s: PhaseSettings, rig: Rig, volume_margin: float) -> None:
+    """Raises DecodeError for parallel sets (no Gray code) that repeat too often within the measuring space."""
+    group = families(decoded.sets)[0]
+    bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), group[-1].g, volume_margin)
+    _check_repeats(group, bounds, plan.camera, s)
+
+
+def _check_repeats(group: Sequence[WrappedSet], bounds: F64, camera: str, s: PhaseSettings) -> None:
+    g = group[-1].g
+    span = unambiguous_span(group, 4 * s.systematic_rad)
+    room = float(np.median(bounds[3] - bounds[2])) / (2 * math.pi * math.hypot(*g))
+    if room > MOST_REPEATS * span:
+        raise DecodeError(
+            f"view '{camera}': the sets along ({g[0]:.4g}, {g[1]:.4g}) repeat after {span:.0f} projector "
+            f"units, a ray crosses {room:.0f} in the measuring space; add a coarser period or a Gray code, or "
+            f"give the rig a smaller volume"
+        )
+
+
+def vote_on_orders(decoded: Decoded, s: PhaseSettings) -> tuple[Decoded, Bool]:
+    """The neighbours' vote on the orders of a view's one direction; also where (H, W) an order has changed.
+
+    `reasons` tells the orders that are uncertain, and may tell more. Darkness and low modulation outweigh an uncertain
+    order, darkness also frames that do not fit.
+    """
+    d, reasons = decoded.directions[0], decoded.reasons
+    uncertain = (reasons & Reason.ORDER_UNCERTAIN) != 0
+    if s.order_votes > 1:
+        trusted = np.isfinite(d.phase) & (d.sigma < s.max_sigma_rad)
+        absolute, uncertain = _elect(d.phase, trusted, uncertain, s)
+    else:
+        absolute = d.phase
+    moved = np.isfinite(absolute) & (absolute != d.phase)
+    out = reasons & ~np.uint16(Reason.ORDER_UNCERTAIN)
+    weak = Reason.DARK | Reason.LOW_MODULATION | Reason.SATURATED
+    out[uncertain & ((out & weak) == 0)] |= np.uint16(Reason.ORDER_UNCERTAIN)
+    out[(out & Reason.DARK) != 0] &= ~np.uint16(Reason.INCONSISTENT)
+    return replace(decoded, directions=(replace(d, phase=absolute),), reasons=out), np.asarray(moved)
 
 
 def _unwrap(

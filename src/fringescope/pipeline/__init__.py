@@ -15,9 +15,11 @@ import numpy as np
 
 from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, response, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError
+from fringescope.pipeline import fast
 from fringescope.settings import Settings
 from fringescope.types import (
     F32,
+    U16,
     AnyArray,
     Board,
     Calibration,
@@ -60,8 +62,16 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
 
     Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do.
     """
-    decoded = clean_view(view, rig, s)
-    grid = triangulate.grid(decoded, decoded.reasons, rig, volume_margin=s.denoise.volume_margin)  # equations 8 to 15
+    geometry.check_baseline(rig, rig.camera(view.plan.camera))
+    view = replace(view, frames=list(view.frames))
+    fused = fast.decode(view, rig, s)  # the same in one pass, for the usual plans
+    if fused is not None:
+        decoded, xyz, sigma = fused
+        reasons = _masked(decoded, decoded.reasons, rig, s)
+        grid = triangulate.blanked(xyz, sigma, reasons, rig, decoded.camera)
+    else:
+        decoded = clean_view(view, rig, s)
+        grid = triangulate.grid(decoded, decoded.reasons, rig, volume_margin=s.denoise.volume_margin)  # eqs 8 to 15
     return phase.with_reasons(decoded, grid.reasons), grid
 
 
@@ -71,10 +81,14 @@ def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
     measured = measured_view(view, s)  # II-C; frames may still be arriving
     decoded = phase.settle_order(measured, view.plan, s.phase, rig, s.denoise.volume_margin)
     reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)  # III-D 1
+    return phase.with_reasons(decoded, _masked(decoded, reasons, rig, s))
+
+
+def _masked(decoded: Decoded, reasons: U16, rig: Rig, s: Settings) -> U16:
+    """The masks that look at a pixel's neighbours, one after the other."""
     reasons = denoise.monotonic(decoded, reasons, rig, s.denoise)  # III-D 2
     reasons = denoise.connected(decoded, reasons, rig, s.denoise)  # III-D 3
-    reasons = denoise.local(decoded, reasons, rig, s.denoise)
-    return phase.with_reasons(decoded, reasons)
+    return denoise.local(decoded, reasons, rig, s.denoise)
 
 
 BAND = 1_000_000  #: pixels of a board picture that are decoded at a time

@@ -1,0 +1,242 @@
+"""The fused way from raw frames to points: the usual plan of a view, block by block (kernels/fused.py).
+
+What it gives is what the stages give, to float32; what it does not take (Gray codes, brackets, several directions,
+response corrections, RGB, very deep measuring spaces) goes the stages' way.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from fringescope import denoise, geometry, phase
+from fringescope.errors import RigError
+from fringescope.kernels import fused as k
+from fringescope.kernels.depths import Depths
+from fringescope.settings import Settings
+from fringescope.threads import WORKERS, in_bands
+from fringescope.types import (
+    F32,
+    F64,
+    AnyArray,
+    Bool,
+    Camera,
+    Decoded,
+    Direction,
+    FrameKey,
+    FringeSet,
+    NoiseModel,
+    PixelFormat,
+    Reason,
+    Rig,
+    Role,
+    ViewInput,
+    ViewPlan,
+)
+
+MOST_ERROR_MM = 1e-4  #: of the depth table against the exact solution
+LARGE = 1 << 20  #: samples of a band of all frames: they stay in the second cache
+TWO_PI = 2 * np.pi
+f4 = np.float32
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """What the kernel needs to know of a view: its frames in the order of its sets, coarse to fine, and the tables."""
+
+    frames: tuple[AnyArray, ...]
+    g: tuple[float, float]
+    noise: NoiseModel
+    table: geometry.DepthTable
+    sets: k.Sets
+    limits: k.Limits
+    depths: Depths
+    bounds: F64  #: (4, h, w) turns
+    usual: F64  #: (8, 8)
+
+
+def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] | None:
+    """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
+    in one pass; None for a view that the fused kernel does not take.
+
+    `view.frames` must be a sequence. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
+    """
+    way = _way(view, rig, s)
+    if way is None:
+        return None
+    H, W = way.frames[0].shape
+    absolute, sigma, A, B, sigma_mm = (np.empty((H, W), np.float32) for _ in range(5))
+    reasons, xyz = np.empty((H, W), np.uint16), np.empty((H, W, 3), np.float32)
+    _by_bands(way, (absolute, sigma, A, B, reasons, xyz, sigma_mm))
+    no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
+    decoded = Decoded(
+        view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise
+    )
+    voted, moved = phase.vote_on_orders(decoded, s.phase)
+    if moved.any():
+        _points_again(voted, moved, way, rig, s, xyz, sigma_mm)
+    return voted, xyz, sigma_mm
+
+
+def _points_again(
+    decoded: Decoded, moved: Bool, way: _Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
+) -> None:
+    """Points of the pixels whose order the vote has changed: by the exact solution."""
+    rows, columns = np.nonzero(moved)
+    camera = rig.camera(decoded.camera)
+    d = decoded.directions[0]
+    uv = np.stack([columns, rows], -1).astype(np.float64)
+    turns = d.phase[moved].astype(np.float64) / TWO_PI
+    table, origin = way.table, geometry.centre(camera.pose)
+    points = geometry.points_by_table(table.cubics, table.step, table.depth, origin, uv, turns)
+    ahead = geometry.points_by_table(table.cubics, table.step, table.depth, origin, uv, turns + 1e-3)
+    xyz[moved] = points
+    sigma_mm[moved] = np.linalg.norm(ahead - points, axis=1) / 1e-3 * d.sigma[moved] / TWO_PI
+    inside = geometry.measuring_space(rig, camera, points, s.denoise.volume_margin)
+    where = geometry.project(rig.projector, points)
+    low, high = geometry.lit_field(rig, camera)
+    with np.errstate(invalid="ignore"):
+        inside &= ((where >= low) & (where <= high)).all(axis=1)
+    bit = np.uint16(Reason.OUT_OF_VOLUME)
+    decoded.reasons[moved] = np.where(inside, decoded.reasons[moved] & ~bit, decoded.reasons[moved] | bit)
+
+
+def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
+    plan, camera = view.plan, rig.camera(view.plan.camera)
+    family = _parallel(plan)
+    frames = _in_order(view, family) if family else None
+    if frames is None or family is None or view.response is not None:
+        return None
+    H, W = frames[0].shape
+    if (camera.lens.width, camera.lens.height) != (W, H):
+        return None  # the stages say what is wrong
+    numbers, g = [n for n, _ in family], family[-1][1]
+    steps = [_fringes(plan, n).steps for n in numbers]
+    every = denoise.odd_stride(H * W)
+    few = phase.measure([(key, f[::every, ::every]) for key, f in view.frames], plan, s.phase, view.noise)
+    if few.background is not few.sets[numbers[-1]].background:
+        return None  # the finest set is not the most accurate one
+    table = _table(rig, camera, g, s.denoise.volume_margin)
+    if table is None:
+        return None
+    phase.check_repeats(few, plan, s.phase, rig, s.denoise.volume_margin)
+    fmt = plan.pixel_format
+    dark, low = denoise.weak(few, fmt, s.denoise)
+    sigma_rad, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
+    angles = np.concatenate([TWO_PI * np.arange(n) / n for n in steps])
+    signs = np.repeat([1.0 if np.dot(h, g) > 0 else -1.0 for _, h in family], steps)  # of sets that point the other way
+    frequency = np.array([float(np.hypot(*h)) for _, h in family])
+    pivot = float(np.median(few.background)) if fmt.bits > 10 else 0.0
+    sets = k.Sets(
+        np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
+        np.cos(angles).astype(f4),
+        (signs * np.sin(angles)).astype(f4),
+        np.append(1.0, frequency[1:] / frequency[:-1]).astype(f4),
+        frequency,
+        fmt.max_value,
+        f4(pivot),
+    )
+    bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
+    return _Way(
+        frames, g, few.noise, table, sets, _limits(few.noise, fmt, steps, sigma_rad, s),
+        _depths(table, rig, camera, s.denoise.volume_margin), bounds, usual,
+    )  # fmt: skip
+
+
+def _parallel(plan: ViewPlan) -> list[tuple[int, tuple[float, float]]] | None:
+    """Number and gradient of each set, coarse to fine; None unless all are fringes of one direction, no two alike."""
+    if plan.pixel_format is PixelFormat.RGB8 or not all(isinstance(one, FringeSet) for one in plan.sets):
+        return None
+    out = [(n, _fringes(plan, n).cycles_per_pixel) for n in range(len(plan.sets))]
+    out.sort(key=lambda one: float(np.hypot(*one[1])))
+    (gx, gy), size = out[-1][1], float(np.hypot(*out[-1][1]))
+    for _, (hx, hy) in out:
+        if abs(gx * hy - gy * hx) >= phase.PARALLEL_RAD * size * float(np.hypot(hx, hy)):
+            return None
+    lengths = [float(np.hypot(*h)) for _, h in out]
+    alike = any(b < 1.0001 * a for a, b in pairwise(lengths))
+    return None if alike or max(_fringes(plan, n).steps for n, _ in out) > 64 else out
+
+
+def _fringes(plan: ViewPlan, n: int) -> FringeSet:
+    one = plan.sets[n]
+    assert isinstance(one, FringeSet)
+    return one
+
+
+def _in_order(
+    view: ViewInput, family: Sequence[tuple[int, tuple[float, float]]]
+) -> tuple[AnyArray, ...] | None:
+    """The frames of the sets, coarse to fine, step by step; None if any is missing, doubled or unlike the others."""
+    there: dict[FrameKey, AnyArray] = {}
+    for key, frame in view.frames:
+        if key in there or frame.ndim != 2:
+            return None
+        there[key] = frame
+    keys = [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(view.plan, n).steps)]
+    if set(keys) != set(there):
+        return None
+    frames = tuple(there[key] for key in keys)
+    like = frames[0]
+    if any(f.shape != like.shape or f.dtype != like.dtype for f in frames) or like.dtype not in (np.uint8, np.uint16):
+        return None
+    return frames if min(like.shape) >= 1 else None
+
+
+def _table(rig: Rig, camera: Camera, g: tuple[float, float], margin: float) -> geometry.DepthTable | None:
+    """A depth table that is accurate enough, or None."""
+    for nodes in (24, 96):
+        try:
+            table = geometry.depth_table(rig, camera, g, margin, max(1, -(-camera.lens.width // nodes)))
+        except RigError:
+            return None
+        if table.error_mm < MOST_ERROR_MM:
+            return table
+    return None
+
+
+def _limits(noise: NoiseModel, fmt: PixelFormat, steps: Sequence[int], sigma_rad: float, s: Settings) -> k.Limits:
+    p, d, scale = s.phase, s.denoise, fmt.full_scale / 255.0
+    bits = (Reason.DARK, Reason.SATURATED, Reason.LOW_MODULATION, Reason.ORDER_UNCERTAIN, Reason.OUT_OF_VOLUME,
+            Reason.INCONSISTENT)  # fmt: skip
+    return k.Limits(
+        f4(noise.a), f4(noise.b), f4(p.systematic_rad / TWO_PI), f4(p.unexpected_sigma**2), f4(p.order_min_margin**2),
+        f4(p.max_misfit**2), np.array([int(p.max_saturated * n) for n in steps]), f4(d.min_background * scale),
+        f4(d.min_modulation * scale), f4(d.min_contrast), f4(d.min_modulation_sigma), f4(sigma_rad / TWO_PI),
+        f4(d.min_fine_modulation), *(np.uint16(b) for b in bits),
+    )  # fmt: skip
+
+
+def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, margin: float) -> Depths:
+    p = rig.projector
+    return Depths(
+        table.cubics.reshape(len(table.cubics), -1),
+        table.step,
+        geometry.centre(camera.pose).astype(f4),
+        f4(table.depth),
+        np.concatenate([p.pose.R.ravel(), p.pose.t]).astype(f4),
+        geometry.lens_vector(p.lens).astype(f4),
+        np.concatenate(geometry.lit_field(rig, camera)).astype(f4),
+        np.concatenate([a.ravel() for a in geometry.measuring_box(rig, camera, margin)]).astype(f4),
+    )
+
+
+def _by_bands(way: _Way, out: tuple[AnyArray, ...]) -> None:
+    """Runs the kernel over bands of rows on all cores; each core copies the rows of all frames into its own scratch."""
+    H, W = way.frames[0].shape
+    rows = max(1, min(LARGE // (len(way.frames) * W), -(-H // WORKERS)))
+    mine = threading.local()
+
+    def band(first: int, last: int) -> None:
+        if not hasattr(mine, "frames"):
+            mine.frames = np.empty((len(way.frames), rows, W), way.frames[0].dtype)
+        for here, frame in zip(mine.frames, way.frames, strict=True):
+            here[: last - first] = frame[first:last]
+        k.decode(0, last - first, mine.frames, first, H, way.sets, way.limits, way.bounds, way.usual, way.depths,
+                 *(a[first:last] for a in out))  # fmt: skip
+
+    in_bands(H, rows, band)
