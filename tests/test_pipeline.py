@@ -116,6 +116,21 @@ def test_scan_view_is_its_stages_one_by_one(rig, views):
     np.testing.assert_allclose(decoded.directions[0].phase[both], d.directions[0].phase[both], atol=5e-5)
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.2, np.pi / 4])
+def test_two_directions_are_judged_by_those_that_tell_depth(rig, rng, turn):
+    """As captures of a board have: along one of the two the phase may not grow with depth at all."""
+    for camera in rig.cameras:
+        angle = core.best_angle(rig, camera) + turn
+        sets = [core.fringes(p, a, n) for a in (angle, angle + np.pi / 2) for p, n in ((270, 4), (60, 4), (16, 8))]
+        plan = core.plan(*sets, pixel_format=PixelFormat.MONO8, plane=rig.projector.plane_size, camera=camera.name)
+        points = core.plane_points(camera, NORMAL, OFFSET)
+        u, v, lit = core.seen(rig, points)
+        view = ViewInput(plan, core.draw(plan, u, v, noise=(0.5, 0.02), rng=rng, lit=lit))
+        _, grid = pipeline.scan_view(view, rig, Settings())
+        assert grid.valid.mean() > 0.8
+        assert np.abs(grid.xyz[grid.valid].astype(float) @ NORMAL - OFFSET).max() < 0.1
+
+
 def test_decode_view_needs_no_rig(rng):
     plan = core.plan(*[core.fringes(p, a, n) for a in (0, np.pi / 2) for p, n in ((450, 4), (70, 4), (16, 8))])
     u, v = core.image(shape=(150, 200))

@@ -32,6 +32,8 @@ from fringescope.types import (
     WrappedSet,
 )
 
+TELLING = 0.5  #: least share of the best direction's sensitivity to depth that a direction needs to be judged by
+
 
 def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> U16:
     """III-D 1: dark, saturated and low-modulation pixels, as reason codes (H, W).
@@ -140,7 +142,7 @@ def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings) -> U
     out = reasons.copy()
     H, W = decoded.shape
     reach = max(1, round(s.monotonic_reach * W / 684))
-    for d in decoded.directions:
+    for d in telling(decoded, rig):
         field = geometry.epipolar_field(rig, rig.camera(decoded.camera), d.g)
         signs, back = np.empty((H, W), np.int8), np.empty((H, W), np.bool_)
         k.gradient_signs(d.phase, d.sigma, out, field, reach, s.monotonic_sigma, signs)
@@ -149,13 +151,28 @@ def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings) -> U
     return out
 
 
+def telling(decoded: Decoded, rig: Rig | None) -> tuple[Direction, ...]:
+    """The directions whose phase tells of the surface: all, or those that tell at least half as much of depth as the
+    best one. Along the others the phase hardly grows with depth; its sign and its jumps would be noise.
+    """
+    if rig is None or len(decoded.directions) == 1:
+        return decoded.directions
+    camera = rig.camera(decoded.camera)
+    weight = []
+    for d in decoded.directions:
+        sigma = d.sigma[np.isfinite(d.sigma)]
+        growth = float(np.median(geometry.epipolar_field(rig, camera, d.g)[..., 2]))
+        weight.append(growth / max(float(np.median(sigma)), 1e-6) if sigma.size else 0.0)
+    return tuple(d for d, w in zip(decoded.directions, weight, strict=True) if w >= TELLING * max(weight))
+
+
 def connected(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -> U16:
     """III-D 3: neighbours whose phases differ by less than T1 form domains; domains of fewer than T2 pixels go.
 
     Pixels that continue too few of their neighbours stand on a jump and go first.
     """
     out = reasons.copy()
-    for d in decoded.directions:
+    for d in telling(decoded, rig):
         field = _slopes(d, reasons, decoded, rig)
         loose = np.empty(decoded.shape, np.bool_)
         k.loose_pixels(
@@ -172,7 +189,7 @@ def connected(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSetting
 def local(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -> U16:
     """The fourth test: a point's phase lies within some of its own sigmas of the surface of its neighbours."""
     out = reasons.copy()
-    for d in decoded.directions:
+    for d in telling(decoded, rig):
         for _ in range(int(s.local_rounds)):
             field = _slopes(d, out, decoded, rig)
             label = np.empty(decoded.shape, np.int32)

@@ -122,17 +122,23 @@ def test_rendered_spheres_by_the_own_rig(shared: Path, samples: int, tmp_path: P
 
 @few_and_all
 def test_views_agree_as_by_the_true_rig(rendered: Path, samples: int, record_property: Any) -> None:
-    """The distance between the views' surfaces is noise for the most part: the true rig's is what can be had."""
+    """The distance between the views' surfaces is noise for the most part: the true rig's is what can be had.
+
+    One view's share in it, over 5 x 5 points, is 1.6 um at most (the true rig: 1.2).
+    """
     own = evaluate.agreement(
         measured(rendered, "sphere", samples).grids, calibrated(rendered / "calibration", samples).rig
-    ).median_um
+    )
     rig = store.read_rig(rendered / "truth" / "rig.json")
     views = store.view_inputs(store.read_capture(rendered / "sphere"))
-    true = evaluate.agreement(pipeline.scan(views, rig, S, surface=False).grids, rig).median_um
-    assert own is not None
-    assert true is not None
-    record_property("own rig, true rig, um", (round(own, 3), round(true, 3)))
-    assert own <= (1.35 if samples else 1.15) * true  # a seventh of the phases makes a rig a little worse
+    true = evaluate.agreement(pipeline.scan(views, rig, S, surface=False).grids, rig)
+    assert own.one_view_um is not None
+    assert own.median_um is not None
+    assert true.median_um is not None
+    record_property("one view, own rig, um", round(own.one_view_um, 3))
+    record_property("own rig, true rig, um", (round(own.median_um, 3), round(true.median_um, 3)))
+    assert own.one_view_um <= 1.6
+    assert own.median_um <= (1.35 if samples else 1.15) * true.median_um  # a seventh of the phases makes a rig a little worse
 
 
 # ------------------------------------------------------------------------------------------------------ a real session

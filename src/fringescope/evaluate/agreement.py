@@ -37,9 +37,14 @@ class PairAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All pairs of views: median of absolute distances and systematic part in um; None where no views overlap."""
+    """All pairs of views: median of absolute distances and systematic part in um; None where no views overlap.
+
+    `one_view_um` is the share of each of the two surfaces in that distance, as for errors that are independent: the
+    median over the square root of two.
+    """
 
     median_um: float | None
+    one_view_um: float | None
     systematic_um: float | None
     pairs: tuple[PairAgreement, ...]
 
@@ -66,10 +71,11 @@ def agreement(grids: Sequence[Grid], rig: Rig, window: int = WINDOW) -> Agreemen
         )  # fmt: skip
         every.append(d)
     if not pairs:
-        return Agreement(None, None, ())
+        return Agreement(None, None, None, ())
     n = np.array([p.points for p in pairs], dtype=float)
     systematic_um = float(np.sqrt(np.average([p.systematic_um**2 for p in pairs], weights=n)))
-    return Agreement(1e3 * float(np.median(np.abs(np.concatenate(every)))), systematic_um, tuple(pairs))
+    median_um = 1e3 * float(np.median(np.abs(np.concatenate(every))))
+    return Agreement(median_um, median_um / np.sqrt(2), systematic_um, tuple(pairs))
 
 
 def systematic_part(rows: NDArray[np.intp], columns: NDArray[np.intp], error: F64, shape: tuple[int, ...]) -> float:
