@@ -140,7 +140,8 @@ def test_two_directions_test_each_other(rig: Rig) -> None:
 
 
 def verdict(rig, systematic, **kw):
-    a = evaluate.Agreement(1.0, 0.7, systematic, ()) if systematic is not None else evaluate.Agreement(None, None, None, ())
+    some, one = (1.0, 0.7) if systematic is not None else (None, None)
+    a = evaluate.Agreement(some, one, systematic, ())
     return evaluate.judge(rig, a, VerifySettings(), **kw)
 
 

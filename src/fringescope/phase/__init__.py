@@ -8,11 +8,11 @@ from fringescope.phase.measure import measure, put_rows, room_for, with_reasons
 from fringescope.phase.noise import estimate_noise
 from fringescope.phase.order import (
     PARALLEL_RAD,
-    check_repeats,
     families,
     field_bounds,
     projector_coordinates,
     settle_order,
+    trial,
     unambiguous_span,
     vote_on_orders,
 )
@@ -23,7 +23,6 @@ __all__ = [
     "FringeSums",
     "GrayBits",
     "Measured",
-    "check_repeats",
     "estimate_noise",
     "families",
     "field_bounds",
@@ -34,6 +33,7 @@ __all__ = [
     "put_rows",
     "room_for",
     "settle_order",
+    "trial",
     "unambiguous_span",
     "vote_on_orders",
     "with_reasons",

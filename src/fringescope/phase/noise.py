@@ -4,62 +4,125 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from fringescope.phase.sums import Measured
-from fringescope.types import AnyArray, NoiseModel
+from fringescope.types import F64, AnyArray, NoiseModel
 from fringescope.types.capture import ROUNDING
 
 SAMPLES = 100_000  #: pixels that are enough to tell the noise
+SPOILT = 3.0  #: a set whose residuals are this many times those of the quietest set is no measure of noise
+MOST_READ_NOISE = 5.0  #: 8-bit codes; more is no noise of a sensor
+MOST_SHOT_NOISE = 0.25  #: variance per intensity, 8-bit codes: a full well of 1000 electrons
+
+
+class _Bins(NamedTuple):
+    """What one set says: variance at some levels, and how much each counts."""
+
+    level: F64
+    variance: F64
+    weight: F64
 
 
 def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
     """Sensor noise `variance = a + b I` from the capture itself: the residuals about the sinusoids of sets with N > 3.
 
-    In bins of the background the median residual (a chi-squared of N - 3 degrees of freedom) stands for the variance;
-    a line through the bins gives a and b. With three steps only, the backgrounds of two sets of one exposure differ
-    by noise alone and serve instead. Falls back to 0.6 codes of read noise and b = 0.03 of the 8-bit scale.
+    In bins of the background the residuals (a chi-squared of N - 3 degrees of freedom, outliers left out) give the
+    variance; a line through the bins gives a and b. Sets that are far noisier than the quietest one are spoilt (a lost
+    frame, motion) and do not count; no line is steeper or higher than sensors are. With three steps only, the
+    backgrounds of two sets of one exposure differ by noise alone and serve instead. Falls back to 0.6 codes of read
+    noise and b = 0.03 of the 8-bit scale.
     """
-    levels: list[float] = []
-    variances: list[float] = []
-    weights: list[float] = []
-    samples: list[tuple[AnyArray, AnyArray, int]] = []
     thin = round(math.sqrt(measured[0].phase.size / SAMPLES)) | 1 if measured else 1  # odd: every colour of a mosaic
     cut = (slice(None, None, thin), slice(None, None, thin))
+    sets: list[_Bins] = []
     for m in measured:
         if m.steps > 3:
             ok = m.clipped[cut] == 0
-            samples.append((m.background[cut][ok], m.variance[cut][ok], m.steps - 3))
-    if not samples:
+            sets.append(_binned(m.background[cut][ok], m.variance[cut][ok], m.steps - 3, max_value))
+    if not sets:
         for m1, m2 in pairwise(measured):
             if m1.phase.shape == m2.phase.shape and m1.fringe_set.exposure_us == m2.fringe_set.exposure_us:
                 ok = (m1.clipped[cut] == 0) & (m2.clipped[cut] == 0)
                 A = m1.background[cut][ok]
                 d = A.astype(np.float64) - m2.background[cut][ok]
                 d -= np.median(d) if d.size else 0.0
-                samples.append((A, d * d / (1 / m1.steps + 1 / m2.steps), 1))
-    for A, v, dof in samples:
-        ok = (0.01 * max_value < A) & (0.9 * max_value > A)
-        if np.count_nonzero(ok) < 400:
-            continue
-        level, rest = A[ok], v[ok]
+                sets.append(_binned(A, d * d / (1 / m1.steps + 1 / m2.steps), 1, max_value))
+    sets = _unspoilt([b for b in sets if len(b.level)])
+    scale = max_value / 255.0
+    if sum(len(b.level) for b in sets) < 3:
+        return NoiseModel(0.36 * scale * scale, 0.03 * scale, "default")
+    level, variance, weight = (np.concatenate(part) for part in zip(*sets, strict=True))
+    a, b = _line(level, np.maximum(variance, ROUNDING), weight)
+    return NoiseModel(min(a, (MOST_READ_NOISE * scale) ** 2), min(b, MOST_SHOT_NOISE * scale), "residuals")
+
+
+def _binned(background: AnyArray, variance: AnyArray, dof: int, max_value: int) -> _Bins:
+    """Variance in up to 24 bins of the background, each with the mean level of its pixels."""
+    out: list[tuple[float, float, float]] = []
+    ok = (0.01 * max_value < background) & (0.9 * max_value > background)
+    if np.count_nonzero(ok) >= 400:
+        level, rest = background[ok].astype(np.float64), variance[ok].astype(np.float64)
         edges = np.unique(np.quantile(level, np.linspace(0, 1, 25)))
         where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(len(edges) - 2, 0))
         for n in range(len(edges) - 1):
             inside = where == n
             if inside.sum() >= 50:
-                levels.append(float(level[inside].mean()))
-                variances.append(float(np.median(rest[inside])) / _chi2_median(dof))
-                weights.append(float(inside.sum()) * dof)
-    if len(levels) < 3:
-        scale = max_value / 255.0
-        return NoiseModel(0.36 * scale * scale, 0.03 * scale, "default")
-    x, y = np.array(levels), np.maximum(np.array(variances), ROUNDING)
-    w = np.array(weights) / y**2
+                out.append((float(level[inside].mean()), _typical(rest[inside], dof), float(inside.sum()) * dof))
+    return _Bins(*np.array(out, np.float64).reshape(-1, 3).T)
+
+
+def _typical(residual: F64, dof: int) -> float:
+    """Variance behind residuals that are chi-squared but for outliers: a truncated mean, made consistent.
+
+    No median: with four steps the residuals of integer codes take few values, and a median jumps between them.
+    """
+    v = np.sort(residual)
+    start, limit, kept = _truncation(dof)
+    estimate = float(v[: max(int(0.8 * len(v)), 1)].mean()) / start
+    for _ in range(6):
+        inside = v[: int(np.searchsorted(v, limit * estimate, side="right"))]
+        if not len(inside) or len(inside) == len(v):
+            return float(v.mean()) if len(inside) else estimate
+        estimate = float(inside.mean()) / kept
+    return estimate
+
+
+@lru_cache(maxsize=64)
+def _truncation(dof: int) -> tuple[float, float, float]:
+    """Of a chi-squared over its degrees of freedom: mean of its lowest 80 %; 99.8 % quantile, and the mean below it."""
+    few, most = float(chi2.ppf(0.8, dof)), float(chi2.ppf(0.998, dof))
+    return float(chi2.cdf(few, dof + 2)) / 0.8, most / dof, float(chi2.cdf(most, dof + 2)) / 0.998
+
+
+def _unspoilt(sets: Sequence[_Bins]) -> list[_Bins]:
+    """The sets whose residuals are like those of the quietest, at like levels."""
+    if len(sets) < 2:
+        return list(sets)
+    lines = [_line(b.level, np.maximum(b.variance, ROUNDING), b.weight) if len(b.level) > 2 else None for b in sets]
+    middle = float(np.median(np.concatenate([b.level for b in sets])))
+    heights = [line[0] + line[1] * middle if line is not None else math.inf for line in lines]
+    best = lines[int(np.argmin(heights))]
+    if best is None:
+        return list(sets)
+    out = []
+    for b in sets:
+        expected = np.maximum(best[0] + best[1] * b.level, ROUNDING)
+        if float(np.average(np.maximum(b.variance, ROUNDING) / expected, weights=b.weight)) < SPOILT:
+            out.append(b)
+    return out
+
+
+def _line(x: F64, y: F64, weight: F64) -> tuple[float, float]:
+    """Intercept and slope (at least 0) through variances y at levels x; bins spoilt by motion or gamma lie above it."""
+    w = weight / y**2
     intercept, slope = 0.0, 0.0
-    for _ in range(8):  # iteratively reweighted: bins spoilt by motion or gamma lie above the line
+    for _ in range(8):
         mean = float(np.average(x, weights=w))
         middle = float(np.average(y, weights=w))
         spread = max(float(np.sum(w * (x - mean) ** 2)), 1e-12)
@@ -68,10 +131,5 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
         line = np.maximum(intercept + slope * x, ROUNDING)
         off = (y - line) / line
         scatter = 1.4826 * float(np.median(np.abs(off))) + 1e-3
-        w = np.array(weights) / line**2 / (1 + (off / (3 * scatter)) ** 2)
-    return NoiseModel(intercept, slope, "residuals")
-
-
-def _chi2_median(dof: int) -> float:
-    """Median over mean of a chi-squared variable (Wilson and Hilferty; exact 0.4549 for one degree of freedom)."""
-    return 0.45494 if dof == 1 else (1 - 2 / (9 * dof)) ** 3
+        w = weight / line**2 / (1 + (off / (3 * scatter)) ** 2)
+    return intercept, slope

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -29,6 +30,9 @@ from fringescope.types import (
 )
 
 MOST_REPEATS = 2.5  #: of what the sets tell apart, that a ray may cross in the measuring space
+CONFIRMATIONS = 3  #: rounds in which pixels that are certain confirm uncertain neighbours
+LEAST_SYSTEMATIC = 0.005  #: rad; less is not believed of any fringes
+MOST_MISS = 2.5  #: systematic errors, amplified by the ratio of the periods, by which a set may miss all over
 PARALLEL_RAD = 1e-4  #: sets whose gradients differ less than this in angle (either sign) unwrap each other
 
 
@@ -84,13 +88,13 @@ def settle_order(
     one with the least chi squared over all sets and Gray codes wins; neighbours then vote on single wrong orders.
     Raises DecodeError if a direction has neither sets nor code that span the field (without a rig).
     """
-    groups = families(decoded.sets)
     out: list[Direction] = []
+    notes: list[str] = []
     reasons = decoded.reasons.copy()
     used: set[int] = set()
-    for group in groups:
+    for group in families(decoded.sets):
         g = group[-1].g
-        gray, half, soft = _gray_phase(decoded.gray, g, used)
+        gray, half, soft = _gray_phase(decoded.gray, group[-1], used)
         if rig is None:
             lo, hi = field_bounds(g, plan.projector_size)
             bounds = np.broadcast_to(np.array([lo, hi, lo, hi])[:, None, None], (4, 2, 2)).copy()
@@ -105,7 +109,9 @@ def settle_order(
             bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), g, volume_margin)
             if gray is None:
                 _check_repeats(group, bounds, plan.camera, s)
-        direction, bad = _unwrap(group, bounds, gray, half, soft, s)
+        trial = _trial(group, bounds, gray, half, soft, s)
+        notes += trial.notes
+        direction, bad = _unwrap(group, bounds, gray, half, soft, replace(s, systematic_rad=trial.systematic_rad))
         if rig is not None:  # no order leads into the measuring space
             lost = ~np.isfinite(direction.phase) & np.isfinite(direction.sigma)
             bad[lost] = np.uint16(Reason.OUT_OF_VOLUME)
@@ -116,14 +122,77 @@ def settle_order(
             direction, bad = _from_gray(code)
             out.append(direction)
             reasons |= bad
-    return replace(decoded, directions=tuple(out), reasons=reasons)
+    return replace(decoded, directions=tuple(out), reasons=reasons, notes=(*decoded.notes, *notes))
 
 
-def check_repeats(decoded: Decoded, plan: ViewPlan, s: PhaseSettings, rig: Rig, volume_margin: float) -> None:
-    """Raises DecodeError for parallel sets (no Gray code) that repeat too often within the measuring space."""
+class Trial(NamedTuple):
+    """What a trial on some pixels says of parallel sets: errors of their phases beyond noise, and words for people."""
+
+    systematic_rad: float
+    notes: tuple[str, ...]
+
+
+def trial(decoded: Decoded, plan: ViewPlan, s: PhaseSettings, rig: Rig, volume_margin: float) -> Trial:
+    """How well the parallel sets of a view (one direction, no Gray code) fit each other; see `Trial`.
+
+    Raises DecodeError where they repeat too often within the measuring space.
+    """
     group = families(decoded.sets)[0]
     bounds = geometry.phase_bounds(rig, rig.camera(plan.camera), group[-1].g, volume_margin)
     _check_repeats(group, bounds, plan.camera, s)
+    return _trial(group, bounds, None, 0.0, 0.0, s)
+
+
+def _trial(
+    group: Sequence[WrappedSet], bounds: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
+) -> Trial:
+    """See `Trial`. Pure fringes earn a smaller systematic error than `systematic_rad`, if they need it.
+
+    The errors are judged by how each set misses what the next coarser one predicts, where both are clear.
+    """
+    usual = Trial(s.systematic_rad, ())
+    if len(group) < 2:
+        return usual
+    cut = (slice(None, None, max(1, math.isqrt(group[0].phase.size // 40_000)) | 1),) * 2
+    thin = [replace(w, phase=w.phase[cut].copy(), sigma=w.sigma[cut].copy()) for w in group]
+    code = None if gray is None else np.ascontiguousarray(gray[cut])
+    absolute, margin = _search(thin, bounds, code, half, soft, s)
+    ok = np.isfinite(absolute)
+    for w in thin:
+        ok &= w.sigma < 0.2
+    if ok.sum() < 200:
+        return usual
+    f = [math.hypot(*w.g) for w in thin]
+    phi = absolute[ok].astype(np.float64)
+    off = [_wrapped(w.phase[ok] - phi * (fk / f[-1])) for w, fk in zip(thin, f, strict=True)]
+    notes: list[str] = []
+    systematic = 0.0
+    for n in range(1, len(thin)):
+        ratio = f[n] / f[n - 1]
+        rest = _wrapped(off[n] - off[n - 1] * ratio)
+        middle = float(np.median(rest))
+        spread = float(np.quantile(np.abs(rest - middle), 0.9)) / 1.645
+        noise = float(np.median(np.hypot(thin[n - 1].sigma[ok] * ratio, thin[n].sigma[ok])))
+        systematic = max(systematic, math.sqrt(max(spread**2 - noise**2, 0.0) + middle**2) / math.hypot(ratio, 1.0))
+        period, other = 1 / f[n], 1 / f[n - 1]
+        if noise < 0.5 and spread > 1.5:
+            notes.append(
+                f"the fringes of period {period:.4g} have nothing to do with what those of {other:.4g} predict: look "
+                "for frames out of order, a wrong period or a wrong sign"
+            )
+        elif abs(middle) > max(MOST_MISS * s.systematic_rad * ratio, 0.6) and spread < 1.5:
+            notes.append(
+                f"the fringes of period {period:.4g} miss what those of {other:.4g} predict by {middle:.2f} rad all "
+                "over: are their steps in order, and none left out?"
+            )
+    needed = float(np.mean(margin[ok] < s.order_min_margin)) > 0.02
+    if needed and not notes and systematic < s.systematic_rad:
+        return Trial(max(1.3 * systematic, LEAST_SYSTEMATIC), ())
+    return Trial(s.systematic_rad, tuple(notes))
+
+
+def _wrapped(a: F64) -> F64:
+    return np.asarray(a - 2 * math.pi * np.round(a / (2 * math.pi)))
 
 
 def _check_repeats(group: Sequence[WrappedSet], bounds: F64, camera: str, s: PhaseSettings) -> None:
@@ -162,14 +231,7 @@ def vote_on_orders(decoded: Decoded, s: PhaseSettings) -> tuple[Decoded, Bool]:
 def _unwrap(
     group: Sequence[WrappedSet], bounds: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
 ) -> tuple[Direction, U16]:
-    phases = np.stack([w.phase for w in group])
-    sigmas = np.stack([np.hypot(w.sigma, np.float32(s.systematic_rad)) for w in group])
-    freq = np.array([math.hypot(*w.g) for w in group])
-    shape = phases.shape[1:]
-    absolute, margin = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    none = np.zeros((0, 0), np.float32)
-    unexpected = s.unexpected_sigma**2
-    k.unwrap(phases, sigmas, freq, bounds, unexpected, none if gray is None else gray, half, soft, absolute, margin)
+    absolute, margin = _search(group, bounds, gray, half, soft, s)
     uncertain = ~(margin >= s.order_min_margin)
     if s.order_votes > 1:
         trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)
@@ -178,10 +240,24 @@ def _unwrap(
     return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons.astype(np.uint16)
 
 
+def _search(
+    group: Sequence[WrappedSet], bounds: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
+) -> tuple[F32, F32]:
+    """The absolute phase of the finest set by all sets and the code of each pixel alone, and its margin."""
+    phases = np.stack([w.phase for w in group])
+    sigmas = np.stack([np.hypot(w.sigma, np.float32(s.systematic_rad)) for w in group])
+    freq = np.array([math.hypot(*w.g) for w in group])
+    absolute, margin = np.empty_like(phases[0]), np.empty_like(phases[0])
+    none = np.zeros((0, 0), np.float32)
+    unexpected = s.unexpected_sigma**2
+    k.unwrap(phases, sigmas, freq, bounds, unexpected, none if gray is None else gray, half, soft, absolute, margin)
+    return absolute, margin
+
+
 def _elect(absolute: F32, trusted: Bool, uncertain: Bool, s: PhaseSettings) -> tuple[F32, Bool]:
     """Repair single wrong orders by the vote of the neighbours; returns the phase, and which orders stay uncertain.
 
-    Three rounds among all trusted pixels change orders that a majority contradicts. In a last round only pixels that
+    Three rounds among all trusted pixels change orders that a majority contradicts. In the last rounds only pixels that
     are certain vote: they confirm, or fail to confirm, the orders of the others. A region that is uncertain as a
     whole stays so.
     """
@@ -203,9 +279,14 @@ def _elect(absolute: F32, trusted: Bool, uncertain: Bool, s: PhaseSettings) -> t
         voters = np.where(trusted, absolute, nan)
         asked = cv2.dilate(moved.view(np.uint8), window).view(bool)  # elsewhere the vote would be the same again
     split = changed == -128
-    sure = np.where(trusted & ~uncertain & ~split, absolute, nan)
-    k.order_votes(absolute, sure, uncertain, radius, least, s.order_majority, slope, out, changed)
-    return absolute, np.asarray((uncertain & (changed != 127)) | split)
+    for _ in range(CONFIRMATIONS):
+        sure = np.where(trusted & ~uncertain & ~split, absolute, nan)
+        k.order_votes(absolute, sure, uncertain, radius, least, s.order_majority, slope, out, changed)
+        confirmed = uncertain & (changed == 127)
+        uncertain = uncertain & ~confirmed
+        if not confirmed.any():
+            break
+    return absolute, np.asarray(uncertain | split)
 
 
 def _usual_slope(phase: F32) -> float:
@@ -221,10 +302,12 @@ def _usual_slope(phase: F32) -> float:
     return min(max(4 * usual, 0.2), 1.2)
 
 
-def _gray_phase(
-    codes: Sequence[GrayCode], g: tuple[float, float], used: set[int]
-) -> tuple[F32 | None, float, float]:
-    """The finest phase at the middle of each pixel's Gray cell, half a cell and the softness of its edge, radians."""
+def _gray_phase(codes: Sequence[GrayCode], fine: WrappedSet, used: set[int]) -> tuple[F32 | None, float, float]:
+    """The finest phase at the middle of each pixel's Gray cell, half a cell and the softness of its edge, radians.
+
+    A code is misread where a pixel straddles the edge of a cell: within about one and a half pixels of it.
+    """
+    g = fine.g
     best: tuple[F32 | None, float, float] = (None, 0.0, 0.0)
     cell = math.inf
     for i, code in enumerate(codes):
@@ -237,8 +320,23 @@ def _gray_phase(
             u = -0.5 + (code.value + 0.5) * code.cell
             phase = np.where(code.value >= 0, 2 * math.pi * along * u, np.nan).astype(np.float32)
             half = math.pi * abs(along) * code.cell
-            best = (phase, half, 0.1 * half + 0.3)
+            best = (phase, half, min(0.1 * half + 0.3, _per_pixel(fine)))
     return best
+
+
+def _per_pixel(w: WrappedSet) -> float:
+    """Half of how far the phase usually goes from pixel to pixel (nine in ten go less), and its noise, radians."""
+    stride = max(1, math.isqrt(w.phase.size // 60_000))
+    sigma = w.sigma[::stride, ::stride]
+    if not (sigma < 0.3).any():
+        return math.inf
+    step = 0.0
+    for axis, cut in ((1, (slice(None, None, stride), slice(None))), (0, (slice(None), slice(None, None, stride)))):
+        a = np.diff(np.where(w.sigma[cut] < 0.3, w.phase[cut], np.nan), axis=axis)
+        a = a[np.isfinite(a)]
+        turned = np.abs(a - 2 * math.pi * np.round(a / (2 * math.pi)))
+        step = max(step, float(np.quantile(turned, 0.9))) if turned.size else step
+    return 0.5 * step + float(np.median(sigma[sigma < 0.3])) + 0.02
 
 
 def _from_gray(code: GrayCode) -> tuple[Direction, U16]:

@@ -266,6 +266,7 @@ def scan(
     times: dict[str, float] = {}
     grids: list[Grid] = []
     photos: list[Photo] = []
+    notes: dict[str, tuple[str, ...]] = {}
     figures: dict[str, Any] = {"views": {}}
     for n, view in enumerate(views):
         tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
@@ -276,12 +277,14 @@ def scan(
         times[f"scan_view {grid.camera}"] = perf_counter() - start
         figures["views"][grid.camera] = _figures(view, decoded, grid)
         figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
+        notes[grid.camera] = tuple(f"{grid.camera}: {note}" for note in decoded.notes)
     order = np.argsort([g.view for g in grids])
     grids, photos = [grids[i] for i in order], [photos[i] for i in order]
     tell("comparing the views", 0.7)
     start = perf_counter()
     grids = list(denoise.agree(grids, rig, s.denoise))
-    verdicts = tuple(denoise.verdict(g, figures["views"][g.camera]["interpolated"]) for g in grids)
+    verdicts = [denoise.verdict(g, figures["views"][g.camera]["interpolated"]) for g in grids]
+    verdicts = [replace(v, words=(*v.words, *notes[v.camera])) for v in verdicts]
     if not any(v.points for v in verdicts):
         raise EmptyResultError("no point was left; " + "; ".join(w for v in verdicts for w in v.words[1:]))
     times["agree"] = perf_counter() - start
@@ -302,9 +305,8 @@ def scan(
         times["mesh"] = perf_counter() - start
     tell("done", 1.0)
     figures["times_s"] = times
-    return Scan(
-        tuple(grids), cloud, levels[0] if levels else None, verdicts, figures, levels[-1] if levels else None, every
-    )
+    fine, coarse = (levels[0], levels[-1]) if levels else (None, None)
+    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, coarse, every)
 
 
 def _silent(_what: str, _share: float) -> None:

@@ -51,6 +51,7 @@ class _Way:
     frames: tuple[AnyArray, ...]
     g: tuple[float, float]
     noise: NoiseModel
+    notes: tuple[str, ...]
     table: geometry.DepthTable
     sets: k.Sets
     limits: k.Limits
@@ -74,7 +75,8 @@ def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] |
     _by_bands(way, (absolute, sigma, A, B, reasons, xyz, sigma_mm))
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
-        view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise
+        view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
+        way.notes,
     )
     voted, moved = phase.vote_on_orders(decoded, s.phase)
     if moved.any():
@@ -123,7 +125,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
     table = _table(rig, camera, g, s.denoise.volume_margin)
     if table is None:
         return None
-    phase.check_repeats(few, plan, s.phase, rig, s.denoise.volume_margin)
+    trial = phase.trial(few, plan, s.phase, rig, s.denoise.volume_margin)
     fmt = plan.pixel_format
     dark, low = denoise.weak(few, fmt, s.denoise)
     sigma_rad, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
@@ -141,10 +143,9 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
         f4(pivot),
     )
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
-    return _Way(
-        frames, g, few.noise, table, sets, _limits(few.noise, fmt, steps, sigma_rad, s),
-        _depths(table, rig, camera, s.denoise.volume_margin), bounds, usual,
-    )  # fmt: skip
+    limits = _limits(few.noise, fmt, steps, sigma_rad, trial.systematic_rad, s)
+    depths = _depths(table, rig, camera, s.denoise.volume_margin)
+    return _Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
 def _parallel(plan: ViewPlan) -> list[tuple[int, tuple[float, float]]] | None:
@@ -199,12 +200,14 @@ def _table(rig: Rig, camera: Camera, g: tuple[float, float], margin: float) -> g
     return None
 
 
-def _limits(noise: NoiseModel, fmt: PixelFormat, steps: Sequence[int], sigma_rad: float, s: Settings) -> k.Limits:
+def _limits(
+    noise: NoiseModel, fmt: PixelFormat, steps: Sequence[int], sigma_rad: float, systematic_rad: float, s: Settings
+) -> k.Limits:
     p, d, scale = s.phase, s.denoise, fmt.full_scale / 255.0
     bits = (Reason.DARK, Reason.SATURATED, Reason.LOW_MODULATION, Reason.ORDER_UNCERTAIN, Reason.OUT_OF_VOLUME,
             Reason.INCONSISTENT)  # fmt: skip
     return k.Limits(
-        f4(noise.a), f4(noise.b), f4(p.systematic_rad / TWO_PI), f4(p.unexpected_sigma**2), f4(p.order_min_margin**2),
+        f4(noise.a), f4(noise.b), f4(systematic_rad / TWO_PI), f4(p.unexpected_sigma**2), f4(p.order_min_margin**2),
         f4(p.max_misfit**2), np.array([int(p.max_saturated * n) for n in steps]), f4(d.min_background * scale),
         f4(d.min_modulation * scale), f4(d.min_contrast), f4(d.min_modulation_sigma), f4(sigma_rad / TWO_PI),
         f4(d.min_fine_modulation), *(np.uint16(b) for b in bits),

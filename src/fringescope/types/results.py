@@ -63,6 +63,7 @@ class Decoded:
     modulation: F32  #: B of the finest set, codes
     reasons: U16
     noise: NoiseModel
+    notes: tuple[str, ...] = ()  #: words for people on how the sets fit each other
 
     @property
     def shape(self) -> tuple[int, int]:
