@@ -54,7 +54,7 @@ def by_stages(view, rig, s=S):
     d = phase.measure(view.frames, view.plan, s.phase, view.noise)
     d = phase.settle_order(d, view.plan, s.phase, rig, s.denoise.volume_margin)
     r = denoise.exposed(d, view.plan.pixel_format, s.denoise)
-    return d, triangulate.grid(d, r, rig, volume_margin=s.denoise.volume_margin)
+    return d, triangulate.grid(d, r, rig, volume_margin=s.denoise.volume_margin, rim=s.denoise.rim)
 
 
 def compare(view, rig, s=S, apart=0.0):

@@ -107,7 +107,7 @@ def test_scan_view_is_its_stages_one_by_one(rig, views):
     r = denoise.monotonic(d, r, rig, s.denoise)
     r = denoise.connected(d, r, rig, s.denoise)
     r = denoise.local(d, r, rig, s.denoise)
-    g = triangulate.grid(d, r, rig, volume_margin=s.denoise.volume_margin)
+    g = triangulate.grid(d, r, rig, volume_margin=s.denoise.volume_margin, rim=s.denoise.rim)
     assert (grid.valid != g.valid).mean() < 0.002
     both = grid.valid & g.valid
     np.testing.assert_allclose(grid.xyz[both], g.xyz[both], atol=1e-4)

@@ -184,17 +184,18 @@ def measuring_box(rig: Rig, camera: Camera, margin: float) -> tuple[F64, F64, F6
     return middle, camera.pose.R, np.array([np.inf, np.inf, (far - near) / 2])
 
 
-def lit_field(rig: Rig, camera: Camera) -> tuple[F64, F64]:
+def lit_field(rig: Rig, camera: Camera, rim: float) -> tuple[F64, F64]:
     """Least and greatest (u, v) of the projector's plane that a camera's pixels see whole.
 
-    A pixel that straddles the rim of the field saw half a fringe: half its footprint, in projector units, is left out.
+    A pixel that straddles the rim of the field saw half a fringe: half its footprint, in projector units, is left out,
+    or what the projector's blur mixes with the dark outside, `rim` units along v, if that is more.
     """
     p = rig.projector
     middle = rig.volume.center if rig.volume is not None else working_point(rig)
     footprint = float(transform(camera.pose, middle)[2]) / camera.lens.K[0, 0]
     units_per_mm = np.array([p.lens.K[0, 0], p.lens.K[1, 1]]) / float(transform(p.pose, middle)[2])
-    rim = np.maximum(0.5 * footprint * units_per_mm, 0.5)
-    return rim, np.array(p.plane_size) - 1 - rim
+    low = np.maximum(0.5 * footprint * units_per_mm, rim * units_per_mm / units_per_mm[1])
+    return low, np.array(p.plane_size) - 1 - low
 
 
 @lru_cache(maxsize=64)

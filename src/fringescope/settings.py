@@ -86,6 +86,7 @@ class DenoiseSettings(_Section):
     local_rounds: int = knob(1, "", "how often the local test is repeated on what is left", "", 0, 5)
     agree_sigma: float = knob(6.0, "sigma", "a view contradicts a point if it sees this far behind it", "", 0)
     agree_slack: float = knob(0.5, "pixels", "allowance for the sampling of the other view, in its pixels' footprints", "", 0)
+    rim: float = knob(3.0, "projector-plane units along v", "so much of the edge of the projector's field gives no point: its blur mixes fringes with the dark outside", "", 0)
     volume_margin: float = knob(1.25, "", "the rig's measuring volume is grown by this", "", 1)
 
 

@@ -20,6 +20,7 @@ def grid(
     rig: Rig,
     *,
     volume_margin: float = 1.25,
+    rim: float = 0.5,
     max_miss: float = 6.0,
     pinhole: bool = False,
 ) -> Grid:
@@ -27,7 +28,8 @@ def grid(
 
     `reasons` (H, W): pixels with any bit get no point. Several directions are weighted by 1 / sigma^2; where they
     disagree by more than `max_miss` standard deviations the pixel is ORDER_UNCERTAIN. Points outside the measuring
-    space are OUT_OF_VOLUME. `pinhole` leaves out both lenses' distortion (the paper's equation 15).
+    space are OUT_OF_VOLUME, and those within `rim` units (along v) of the
+    edge of the projector's field. `pinhole` leaves out both lenses' distortion (the paper's equation 15).
     Raises DecodeError if the orders are not settled or the frames are not of the size that the rig was calibrated at,
     RigError if the rig lacks the camera.
     """
@@ -55,7 +57,7 @@ def grid(
     lost = (reasons == 0) & ~np.isfinite(sigma_mm)
     out[lost] |= np.uint16(Reason.OUT_OF_VOLUME)
     out[(reasons == 0) & (miss > max_miss)] |= np.uint16(Reason.ORDER_UNCERTAIN)
-    field, box = geometry.lit_field(rig, camera), geometry.measuring_box(rig, camera, volume_margin)
+    field, box = geometry.lit_field(rig, camera, rim), geometry.measuring_box(rig, camera, volume_margin)
     bit = np.uint16(Reason.OUT_OF_VOLUME)
     rays.mark_outside(
         xyz, projector.pose.R, projector.pose.t, geometry.lens_vector(projector.lens), *field, *box, out, bit

@@ -17,8 +17,6 @@ from fringescope.types.capture import ROUNDING
 
 SAMPLES = 100_000  #: pixels that are enough to tell the noise
 SPOILT = 3.0  #: a set whose residuals are this many times those of the quietest set is no measure of noise
-MOST_READ_NOISE = 5.0  #: 8-bit codes; more is no noise of a sensor
-MOST_SHOT_NOISE = 0.25  #: variance per intensity, 8-bit codes: a full well of 1000 electrons
 
 
 class _Bins(NamedTuple):
@@ -34,9 +32,8 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
 
     In bins of the background the residuals (a chi-squared of N - 3 degrees of freedom, outliers left out) give the
     variance; a line through the bins gives a and b. Sets that are far noisier than the quietest one are spoilt (a lost
-    frame, motion) and do not count; no line is steeper or higher than sensors are. With three steps only, the
-    backgrounds of two sets of one exposure differ by noise alone and serve instead. Falls back to 0.6 codes of read
-    noise and b = 0.03 of the 8-bit scale.
+    frame, motion) and do not count. With three steps only, the backgrounds of two sets of one exposure differ by noise
+    and serve instead. Falls back to 0.6 codes of read noise and b = 0.03 of the 8-bit scale.
     """
     thin = round(math.sqrt(measured[0].phase.size / SAMPLES)) | 1 if measured else 1  # odd: every colour of a mosaic
     cut = (slice(None, None, thin), slice(None, None, thin))
@@ -46,20 +43,32 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
             ok = m.clipped[cut] == 0
             sets.append(_binned(m.background[cut][ok], m.variance[cut][ok], m.steps - 3, max_value))
     if not sets:
-        for m1, m2 in pairwise(measured):
-            if m1.phase.shape == m2.phase.shape and m1.fringe_set.exposure_us == m2.fringe_set.exposure_us:
-                ok = (m1.clipped[cut] == 0) & (m2.clipped[cut] == 0)
-                A = m1.background[cut][ok]
-                d = A.astype(np.float64) - m2.background[cut][ok]
-                d -= np.median(d) if d.size else 0.0
-                sets.append(_binned(A, d * d / (1 / m1.steps + 1 / m2.steps), 1, max_value))
+        sets = [_between(m1, m2, thin, max_value) for m1, m2 in pairwise(measured)]
     sets = _unspoilt([b for b in sets if len(b.level)])
-    scale = max_value / 255.0
     if sum(len(b.level) for b in sets) < 3:
+        scale = max_value / 255.0
         return NoiseModel(0.36 * scale * scale, 0.03 * scale, "default")
     level, variance, weight = (np.concatenate(part) for part in zip(*sets, strict=True))
     a, b = _line(level, np.maximum(variance, ROUNDING), weight)
-    return NoiseModel(min(a, (MOST_READ_NOISE * scale) ** 2), min(b, MOST_SHOT_NOISE * scale), "residuals")
+    return NoiseModel(a, b, "residuals")
+
+
+def _between(one: Measured, two: Measured, thin: int, max_value: int) -> _Bins:
+    """What the backgrounds of two sets of one exposure say: they differ by noise, and by the ripple of the response.
+
+    The ripple is smooth along the rows: second differences (every other pixel, for mosaics) leave it out.
+    """
+    if one.phase.shape != two.phase.shape or one.fringe_set.exposure_us != two.fringe_set.exposure_us:
+        return _Bins(*np.zeros((3, 0)))
+    rows = slice(None, None, thin * thin)
+    d = one.background[rows].astype(np.float64) - two.background[rows]
+    clean = (one.clipped[rows] == 0) & (two.clipped[rows] == 0)
+    if d.shape[1] < 5:
+        return _Bins(*np.zeros((3, 0)))
+    bend = d[:, 4:] - 2 * d[:, 2:-2] + d[:, :-4]
+    ok = clean[:, 4:] & clean[:, 2:-2] & clean[:, :-4]
+    level = one.background[rows][:, 2:-2][ok]
+    return _binned(level, bend[ok] ** 2 / (6 * (1 / one.steps + 1 / two.steps)), 1, max_value)
 
 
 def _binned(background: AnyArray, variance: AnyArray, dof: int, max_value: int) -> _Bins:

@@ -71,7 +71,7 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
         grid = triangulate.blanked(xyz, sigma, reasons, rig, decoded.camera)
     else:
         decoded = clean_view(view, rig, s)
-        grid = triangulate.grid(decoded, decoded.reasons, rig, volume_margin=s.denoise.volume_margin)  # eqs 8 to 15
+        grid = _points(decoded, rig, s)  # equations 8 to 15
     return phase.with_reasons(decoded, grid.reasons), grid
 
 
@@ -82,6 +82,11 @@ def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
     decoded = phase.settle_order(measured, view.plan, s.phase, rig, s.denoise.volume_margin)
     reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)  # III-D 1
     return phase.with_reasons(decoded, _masked(decoded, reasons, rig, s))
+
+
+def _points(decoded: Decoded, rig: Rig, s: Settings) -> Grid:
+    d = s.denoise
+    return triangulate.grid(decoded, decoded.reasons, rig, volume_margin=d.volume_margin, rim=d.rim)
 
 
 def _masked(decoded: Decoded, reasons: U16, rig: Rig, s: Settings) -> U16:
@@ -230,7 +235,7 @@ def _deepest(decoded: Decoded, rig: Rig, s: Settings) -> tuple[Grid, list[Direct
     best: tuple[float, Grid, int] | None = None
     for i, d in enumerate(decoded.directions):
         one = replace(decoded, directions=(d,))
-        grid = triangulate.grid(one, decoded.reasons, rig, volume_margin=s.denoise.volume_margin)
+        grid = _points(one, rig, s)
         sigma = float(np.median(grid.sigma[grid.valid])) if grid.valid.any() else np.inf
         if best is None or sigma < best[0]:
             best = (sigma, grid, i)

@@ -100,7 +100,7 @@ def _points_again(
     sigma_mm[moved] = np.linalg.norm(ahead - points, axis=1) / 1e-3 * d.sigma[moved] / TWO_PI
     inside = geometry.measuring_space(rig, camera, points, s.denoise.volume_margin)
     where = geometry.project(rig.projector, points)
-    low, high = geometry.lit_field(rig, camera)
+    low, high = geometry.lit_field(rig, camera, s.denoise.rim)
     with np.errstate(invalid="ignore"):
         inside &= ((where >= low) & (where <= high)).all(axis=1)
     bit = np.uint16(Reason.OUT_OF_VOLUME)
@@ -144,7 +144,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
     )
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
     limits = _limits(few.noise, fmt, steps, sigma_rad, trial.systematic_rad, s)
-    depths = _depths(table, rig, camera, s.denoise.volume_margin)
+    depths = _depths(table, rig, camera, s)
     return _Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
@@ -214,7 +214,7 @@ def _limits(
     )  # fmt: skip
 
 
-def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, margin: float) -> Depths:
+def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -> Depths:
     p = rig.projector
     return Depths(
         table.cubics.reshape(len(table.cubics), -1),
@@ -223,8 +223,8 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, margin: float)
         f4(table.depth),
         np.concatenate([p.pose.R.ravel(), p.pose.t]).astype(f4),
         geometry.lens_vector(p.lens).astype(f4),
-        np.concatenate(geometry.lit_field(rig, camera)).astype(f4),
-        np.concatenate([a.ravel() for a in geometry.measuring_box(rig, camera, margin)]).astype(f4),
+        np.concatenate(geometry.lit_field(rig, camera, s.denoise.rim)).astype(f4),
+        np.concatenate([a.ravel() for a in geometry.measuring_box(rig, camera, s.denoise.volume_margin)]).astype(f4),
     )
 
 
