@@ -64,7 +64,7 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
         out[clipped] |= np.uint16(Reason.SATURATED)
         out[clipped] &= ~np.uint16(Reason.LOW_MODULATION | Reason.ORDER_UNCERTAIN)
         ok = (out | np.uint16(Reason.ORDER_UNCERTAIN)) == Reason.ORDER_UNCERTAIN
-        limit, contrast = usual_exposure(family, ~(dark | low), s, cut)
+        limit, least, contrast = usual_exposure(family, ~(dark | low), s, cut)
         out[ok & (d.sigma > limit)] |= np.uint16(Reason.LOW_MODULATION)
         if len(family) > 1:
             coarse = family[-2]
@@ -72,7 +72,7 @@ def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> 
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = fine.modulation / coarse.modulation * (1 + 2.0 * fine.sigma)  # sigma of B / B is the phase's
             whole = ok & (coarse.saturated == 0) & (fine.saturated == 0)
-            out[whole & (ratio < s.min_fine_modulation * around)] |= np.uint16(Reason.LOW_MODULATION)
+            out[whole & (ratio < least * around)] |= np.uint16(Reason.LOW_MODULATION)
     out[dark] &= ~np.uint16(Reason.ORDER_UNCERTAIN | Reason.INCONSISTENT)
     out[(out & Reason.LOW_MODULATION) != 0] &= ~np.uint16(Reason.ORDER_UNCERTAIN)
     return out
@@ -98,11 +98,13 @@ def odd_stride(pixels: int, enough: int = 100_000) -> int:
 
 def usual_exposure(
     family: Sequence[WrappedSet], ok: Bool, s: DenoiseSettings, cut: tuple[slice, slice] = (slice(None), slice(None))
-) -> tuple[float, F64]:
-    """What is usual in a view, from its well exposed pixels `ok`: the largest sigma of a useful phase, radians, and the
-    modulation of the finest of the parallel sets `family` over that of the next coarser one.
+) -> tuple[float, float, F64]:
+    """What is usual in a view, from its well exposed pixels `ok`: the largest sigma of a useful phase, radians; the
+    least share of the usual modulation of the finest of the parallel sets `family` over that of the next coarser one;
+    and this usual contrast.
 
-    The latter as (8, 8) nodes that span the picture corner on corner: medians of tiles, smoothed. `cut` thins.
+    The latter as (8, 8) nodes that span the picture corner on corner: medians of tiles, smoothed. The share allows for
+    how much the contrast scatters anyway, as where harmonics ripple in three steps. `cut` thins.
     """
     fine = family[-1]
     ok = ok[cut] & (fine.saturated[cut] == 0)
@@ -110,12 +112,12 @@ def usual_exposure(
     limit = max(s.max_sigma_rad, s.max_sigma_factor * float(np.median(sigma))) if sigma.size else np.inf
     usual = np.ones((8, 8), np.float32)
     if len(family) == 1:
-        return limit, usual.astype(np.float64)
+        return limit, 0.0, usual.astype(np.float64)
     coarse = family[-2]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(ok & (coarse.saturated[cut] == 0), fine.modulation[cut] / coarse.modulation[cut], np.nan)
     if not np.isfinite(ratio).any():
-        return limit, np.zeros((8, 8))
+        return limit, 0.0, usual.astype(np.float64)
     H, W = ratio.shape
     usual[:] = np.nanmedian(ratio)
     for a in range(8):
@@ -124,7 +126,10 @@ def usual_exposure(
             tile = tile[np.isfinite(tile)]
             if tile.size > max(16, H * W // 640):
                 usual[a, b] = np.median(tile)
-    return limit, np.asarray(cv2.blur(usual, (3, 3)), np.float64)
+    contrast = np.asarray(cv2.blur(usual, (3, 3)), np.float64)
+    off = np.abs(ratio / (_between(H, 8) @ contrast @ _between(W, 8).T) - 1)
+    scatter = 1.4826 * float(np.nanmedian(off))
+    return limit, min(s.min_fine_modulation, 1 - 3 * scatter), contrast
 
 
 def _between(length: int, nodes: int) -> F64:

@@ -128,7 +128,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
     trial = phase.trial(few, plan, s.phase, rig, s.denoise.volume_margin)
     fmt = plan.pixel_format
     dark, low = denoise.weak(few, fmt, s.denoise)
-    sigma_rad, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
+    sigma_rad, contrast, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
     angles = np.concatenate([TWO_PI * np.arange(n) / n for n in steps])
     signs = np.repeat([1.0 if np.dot(h, g) > 0 else -1.0 for _, h in family], steps)  # of sets that point the other way
     frequency = np.array([float(np.hypot(*h)) for _, h in family])
@@ -143,7 +143,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
         f4(pivot),
     )
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
-    limits = _limits(few.noise, fmt, steps, sigma_rad, trial.systematic_rad, s)
+    limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
     depths = _depths(table, rig, camera, s)
     return _Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
@@ -201,8 +201,9 @@ def _table(rig: Rig, camera: Camera, g: tuple[float, float], margin: float) -> g
 
 
 def _limits(
-    noise: NoiseModel, fmt: PixelFormat, steps: Sequence[int], sigma_rad: float, systematic_rad: float, s: Settings
-) -> k.Limits:
+    noise: NoiseModel, fmt: PixelFormat, steps: Sequence[int], sigma_rad: float, contrast: float,
+    systematic_rad: float, s: Settings,
+) -> k.Limits:  # fmt: skip
     p, d, scale = s.phase, s.denoise, fmt.full_scale / 255.0
     bits = (Reason.DARK, Reason.SATURATED, Reason.LOW_MODULATION, Reason.ORDER_UNCERTAIN, Reason.OUT_OF_VOLUME,
             Reason.INCONSISTENT)  # fmt: skip
@@ -210,7 +211,7 @@ def _limits(
         f4(noise.a), f4(noise.b), f4(systematic_rad / TWO_PI), f4(p.unexpected_sigma**2), f4(p.order_min_margin**2),
         f4(p.max_misfit**2), np.array([int(p.max_saturated * n) for n in steps]), f4(d.min_background * scale),
         f4(d.min_modulation * scale), f4(d.min_contrast), f4(d.min_modulation_sigma), f4(sigma_rad / TWO_PI),
-        f4(d.min_fine_modulation), *(np.uint16(b) for b in bits),
+        f4(contrast), *(np.uint16(b) for b in bits),
     )  # fmt: skip
 
 
