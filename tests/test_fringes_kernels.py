@@ -386,7 +386,7 @@ def test_local_surface_equals_robust_least_squares(seed):
     label = np.empty(p.shape, np.int32)
     regions.domains(p, sigma, reasons, field, 4.0, 0.2, 4.0, label)
     out, roughness = np.empty_like(p), np.empty_like(p)
-    regions.local_surface(p, sigma, label, 2, 6, out, roughness)
+    regions.local_surface(p, sigma, label, np.ones(p.shape, bool), 2, 6, out, roughness)
     seen = 0
     for i, j in np.ndindex(*p.shape):
         want, want_roughness = slow.local_distance(p, sigma, label, 2, 6, i, j)

@@ -16,6 +16,7 @@ import numpy as np
 
 from fringescope import geometry
 from fringescope.kernels import regions as k
+from fringescope.kernels import screens
 from fringescope.settings import DenoiseSettings
 from fringescope.types import (
     F32,
@@ -32,6 +33,7 @@ from fringescope.types import (
     WrappedSet,
 )
 
+CALM = 3.5  #: sigmas; pixels that lie, as all around them, nearer to the local surface need no slower look
 TELLING = 0.5  #: least share of the best direction's sensitivity to depth that a direction needs to be judged by
 
 
@@ -200,10 +202,23 @@ def local(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -
             label = np.empty(decoded.shape, np.int32)
             k.domains(d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, label)
             distance, roughness = np.empty(decoded.shape, np.float32), np.empty(decoded.shape, np.float32)
-            k.local_surface(d.phase, d.sigma, label, int(s.local_window) // 2, int(s.local_least), distance, roughness)
+            asked = _rough(d, out, field, s)
+            k.local_surface(
+                d.phase, d.sigma, label, asked, int(s.local_window) // 2, int(s.local_least), distance, roughness
+            )
             bad = (out == 0) & ~((distance <= s.local_sigma) & (roughness <= s.local_roughness))
             out[bad] |= np.uint16(Reason.NOT_LOCAL)
     return out
+
+
+def _rough(d: Direction, reasons: U16, field: F64, s: DenoiseSettings) -> Bool:
+    """The pixels that have to be judged: those that a quick look does not find calm, if the window is the usual one."""
+    asked = np.ones(reasons.shape, np.bool_)
+    if int(s.local_window) == 5:
+        limit = min(CALM, 0.75 * s.local_sigma)
+        step = max(s.jump_factor * float(field[..., 2].min()), s.jump_floor_rad)
+        screens.rough_pixels(d.phase, d.sigma, reasons, step, limit, asked)
+    return asked
 
 
 def _slopes(d: Direction, reasons: U16, decoded: Decoded, rig: Rig | None) -> F64:

@@ -250,12 +250,13 @@ def _normal_equations(x, y, value, weight, n, terms, M, rhs):
 
 
 @by_rows(lambda phase, *_: phase.shape[0])
-def local_surface(first, last, phase, sigma, label, radius, least, out, roughness):
+def local_surface(first, last, phase, sigma, label, asked, radius, least, out, roughness):
     """Distance of each pixel's phase from the surface of its neighbours, in standard deviations; NaN where too few.
 
     The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain in the
     window, without the pixel itself, by least squares with weights 1 / sigma^2 that let go of outliers (Cauchy at 2.5
     sigma). `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
+    Pixels that are not `asked` (see `screens.rough_pixels`) get 0 for both.
     """
     H, W = phase.shape
     room = (2 * radius + 1) ** 2
@@ -269,6 +270,10 @@ def local_surface(first, last, phase, sigma, label, radius, least, out, roughnes
             roughness[i, j] = np.nan
             own = label[i, j]
             if own < 0:
+                continue
+            if not asked[i, j]:
+                out[i, j] = 0.0
+                roughness[i, j] = 0.0
                 continue
             n = 0
             here = phase[i, j]

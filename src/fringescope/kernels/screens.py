@@ -1,0 +1,148 @@
+"""Quick looks before slow ones: which pixels a mask has to judge at all. Most surfaces are calm almost everywhere.
+
+Each screen passes a pixel only where the slow kernel of `regions.py` or `fringes.py` could not reject or change it; it
+asks for all others (True). In float32, in loops that compilers turn into vector instructions; arrays and scalars only.
+"""
+
+import numpy as np
+from numba import njit
+
+from fringescope.threads import by_rows
+
+BLOCK = 512  #: pixels of a row that are looked at together
+
+_f = np.float32
+_ZERO = np.float32(0)
+_CONTRACT = {"contract"}
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _column_sums(p0, p1, p2, p3, p4, ref, m, a0, a1, a2):
+    """Sums over five rows of the phase, of it times y, times y^2; y = -2 .. 2."""
+    two, four = _f(2), _f(4)
+    for j in range(m):
+        a, b, c, d, e = p0[j] - ref, p1[j] - ref, p2[j] - ref, p3[j] - ref, p4[j] - ref
+        a0[j] = (a + e) + (b + d) + c
+        a1[j] = two * (e - a) + (d - b)
+        a2[j] = four * (a + e) + (b + d)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _quadric(a0, a1, a2, centre, ref, n, c0, c1, c2, c3, c4, c5):
+    """The quadric through 24 neighbours, equal weights, of the phase less that of the pixel in their middle."""
+    two, four = _f(2), _f(4)
+    for j in range(n):
+        u, v, w, x, y = a0[j], a0[j + 1], a0[j + 2], a0[j + 3], a0[j + 4]
+        p = centre[j + 2] - ref
+        s0 = (u + y) + (v + x) + w - _f(25) * p
+        sx = two * (y - u) + (x - v)
+        sxx = four * (u + y) + (v + x) - _f(50) * p
+        sy = (a1[j] + a1[j + 4]) + (a1[j + 1] + a1[j + 3]) + a1[j + 2]
+        sxy = two * (a1[j + 4] - a1[j]) + (a1[j + 3] - a1[j + 1])
+        syy = (a2[j] + a2[j + 4]) + (a2[j + 1] + a2[j + 3]) + a2[j + 2] - _f(50) * p
+        both = sxx + syy
+        bend = (_f(24) * both - _f(100) * s0) * _f(1 / 1480)
+        skew = (sxx - syy) * _f(1 / 70)
+        c0[j] = (_f(270) * s0 - _f(50) * both) * _f(1 / 1480)
+        c1[j] = sx * _f(1 / 50)
+        c2[j] = sy * _f(1 / 50)
+        c3[j] = _f(0.5) * (bend + skew)
+        c4[j] = sxy * _f(1 / 100)
+        c5[j] = _f(0.5) * (bend - skew)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _off_quadric(p, s, centre, y, limit2, n, c0, c1, c2, c3, c4, c5, off):
+    """Raise `off` to the squared residual, less limit2 sigma^2, of the five pixels of a row `y` below the middle."""
+    one, two, four = _f(1), _f(2), _f(4)
+    yy = y * y
+    for j in range(n):
+        base = c0[j] + y * c2[j] + yy * c5[j] + centre[j + 2]
+        slope, bend = c1[j] + y * c4[j], c3[j]
+        a = p[j] - base + two * slope - four * bend
+        b = p[j + 1] - base + one * slope - bend
+        c = p[j + 2] - base
+        d = p[j + 3] - base - one * slope - bend
+        e = p[j + 4] - base - two * slope - four * bend
+        a = a * a - limit2 * (s[j] * s[j])
+        b = b * b - limit2 * (s[j + 1] * s[j + 1])
+        c = c * c - limit2 * (s[j + 2] * s[j + 2])
+        d = d * d - limit2 * (s[j + 3] * s[j + 3])
+        e = e * e - limit2 * (s[j + 4] * s[j + 4])
+        off[j] = max(max(max(a, b), max(c, d)), max(e, off[j]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _steps_between(p, q, r, m, most, mask):
+    """Largest step to the next pixel in a row p and to the row below q, and the reasons of the row r, per column."""
+    for j in range(m - 1):
+        most[j] = max(most[j], max(abs(p[j + 1] - p[j]), abs(q[j] - p[j])))
+        mask[j] |= r[j]
+    most[m - 1] = max(most[m - 1], abs(q[m - 1] - p[m - 1]))
+    mask[m - 1] |= r[m - 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _verdict(off, most, mask, step, n, ask):
+    for j in range(n):
+        steep = max(max(most[j], most[j + 1]), max(max(most[j + 2], most[j + 3]), most[j + 4]))
+        masked = mask[j] | mask[j + 1] | mask[j + 2] | mask[j + 3] | mask[j + 4]
+        ask[j] = (off[j] > _ZERO) | (steep > step) | (masked != 0) | (off[j] != off[j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _some(row):
+    """A value of a row that is a number, or 0: what sums are taken from, so that float32 keeps their digits."""
+    for j in range(len(row)):
+        if row[j] == row[j]:
+            return row[j]
+    return _ZERO
+
+
+@by_rows(lambda phase, *_: phase.shape[0])
+def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
+    """Pixels that `regions.local_surface` (5 x 5) must judge: True in `ask` (H, W).
+
+    The others lie, like their 24 neighbours, within `limit` sigmas of the quadric through these, none of the 25 is
+    masked, and no step between neighbours reaches `step` radians: they are one domain.
+    """
+    H, W = phase.shape
+    m = BLOCK + 4
+    a0, a1, a2 = np.empty(m, np.float32), np.empty(m, np.float32), np.empty(m, np.float32)
+    c0, c1, c2 = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    c3, c4, c5 = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    off, most, mask = np.empty(BLOCK, np.float32), np.empty(m, np.float32), np.empty(m, np.uint16)
+    limit2, step = _f(limit) * _f(limit), _f(step)
+    for i in range(first, last):
+        if i < 2 or i >= H - 2 or W < 5:
+            ask[i, :] = True
+            continue
+        ask[i, :2] = True
+        ask[i, W - 2 :] = True
+        for col in range(2, W - 2, BLOCK):
+            n = min(BLOCK, W - 2 - col)
+            left, right = col - 2, col + n + 2
+            wide = n + 4
+            centre = phase[i, left:right]
+            ref = _some(centre)
+            p0, p1, p3, p4 = (
+                phase[i - 2, left:right], phase[i - 1, left:right], phase[i + 1, left:right], phase[i + 2, left:right]
+            )  # fmt: skip
+            _column_sums(p0, p1, centre, p3, p4, ref, wide, a0, a1, a2)
+            _quadric(a0, a1, a2, centre, ref, n, c0, c1, c2, c3, c4, c5)
+            for j in range(n):
+                off[j] = c0[j] * c0[j] - limit2 * (sigma[i, col + j] * sigma[i, col + j])
+            for y in range(-2, 3):
+                _off_quadric(
+                    phase[i + y, left:right], sigma[i + y, left:right], centre, _f(y), limit2, n,
+                    c0, c1, c2, c3, c4, c5, off,
+                )  # fmt: skip
+            for j in range(wide):
+                most[j] = _ZERO
+                mask[j] = 0
+            for y in range(-2, 3):
+                below = min(y + 1, 2)
+                _steps_between(
+                    phase[i + y, left:right], phase[i + below, left:right], reasons[i + y, left:right], wide, most, mask
+                )
+            _verdict(off, most, mask, step, n, ask[i, col : col + n])
