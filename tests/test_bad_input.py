@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -171,6 +173,33 @@ def test_frames(
     line = refused(verb, capture, *args, "--out", tmp_path / "out")
     assert re.search(says, line), line
     assert "05.png" in line
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes in folders are a POSIX matter")
+@pytest.mark.parametrize("what", ["pipe", "device"])
+@pytest.mark.parametrize("name", ["05.png", "color.png"])
+def test_a_pipe_or_a_device_is_no_frame(
+    capture: Path, rig: Path, tmp_path: Path, refused: Callable[..., str], what: str, name: str
+) -> None:
+    """Opened, a pipe without a writer waits for ever: the run stands aside, so that it can be stopped."""
+    path = capture / "camera1" / name
+    path.unlink(missing_ok=True)
+    if what == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    change(capture, lambda d: d["views"][0].update(color="camera1/color.png") if name == "color.png" else None)
+    told = []
+    for verb, more in (("decode", []), ("reconstruct", ["--rig", rig])):
+        thread = threading.Thread(
+            target=lambda verb=verb, more=more: told.append(refused(verb, capture, *more, "--out", tmp_path / "out")),
+            daemon=True,
+        )
+        thread.start()
+        thread.join(30)
+        assert not thread.is_alive(), f"{verb} hangs"
+    assert len(told) == 2
+    assert all(f"{name}: is a pipe or a device; needed a PNG or TIFF frame" in line for line in told)
 
 
 def test_twelve_bits(tmp_path: Path, refused: Callable[..., str]) -> None:
