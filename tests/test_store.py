@@ -289,6 +289,38 @@ def test_versions(tmp_path: Path, what: str, reader: Any, version: Any, says: st
         reader(path)
 
 
+@pytest.mark.parametrize(("what", "reader"), [
+    ("capture", store.read_capture), ("rig", store.read_rig), ("scan", store.read_scan),
+    ("response", store.read_response),
+])  # fmt: skip
+@pytest.mark.parametrize("key", ["format", "version"])
+def test_a_missing_key_is_called_missing(tmp_path: Path, what: str, reader: Any, key: str) -> None:
+    doc = {"format": f"fringescope-{what}", "version": 1}
+    del doc[key]
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(doc))
+    with pytest.raises(FormatError, match=f'x.json: "{key}" is missing; needed') as e:
+        reader(path)
+    assert "null" not in str(e.value)
+    path.write_text(json.dumps(doc | {key: None}))
+    with pytest.raises(FormatError, match=f'"{key}" is null; needed'):
+        reader(path)
+
+
+@pytest.mark.parametrize("key", ["files", "views"])
+def test_a_scan_without_its_lists_says_which(tmp_path: Path, key: str) -> None:
+    write_a_scan(tmp_path / "s")
+    path = tmp_path / "s" / "scan.json"
+    doc = json.loads(path.read_text())
+    path.write_text(json.dumps(doc | {key: 7}))
+    with pytest.raises(FormatError, match=f'"{key}" is 7; needed'):
+        store.read_scan(tmp_path / "s")
+    del doc[key]
+    path.write_text(json.dumps(doc))
+    with pytest.raises(FormatError, match=f'"{key}" is missing; needed'):
+        store.read_scan(tmp_path / "s")
+
+
 # -------------------------------------------------------------------------------------------------------------- scans
 
 

@@ -282,10 +282,13 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def check_format(doc: Mapping[str, Any], path: Path, format_: str, version: int) -> None:
-    """Refuses another `format` and a higher `version`. Raises FormatError."""
-    if doc.get("format") != format_:
-        raise FormatError(f'{path}: "format" is {shown(doc.get("format"))}; needed "{format_}"')
-    v = doc.get("version")
+    """Refuses another `format` and a higher `version`, and a file without them. Raises FormatError."""
+    for key, needed in (("format", f'"{format_}"'), ("version", f"a whole number from 1 to {version}")):
+        if key not in doc:
+            raise FormatError(f'{path}: "{key}" is missing; needed {needed}: add it, or give another file')
+    if doc["format"] != format_:
+        raise FormatError(f'{path}: "format" is {shown(doc["format"])}; needed "{format_}"')
+    v = doc["version"]
     if isinstance(v, bool) or not isinstance(v, int) or v < 1:
         raise FormatError(f'{path}: "version" is {shown(v)}; needed a whole number from 1 to {version}')
     if v > version:

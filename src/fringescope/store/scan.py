@@ -190,9 +190,11 @@ def read_scan(folder: Path | str, *, grids: bool = True, check: bool = True) -> 
     doc = files.read_json(path, "a scan (a folder with scan.json)")
     files.check_format(doc, path, FORMAT, VERSION)
     folder = path.parent
-    listed = doc.get("files")
-    if not isinstance(listed, dict) or not isinstance(doc.get("views"), list):
-        raise FormatError(f'{path}: needed "files" and "views"')
+    for key, kind, needed in (("files", dict, "an object {...}"), ("views", list, "a list [...]")):
+        if not isinstance(doc.get(key), kind):
+            came = f"is {files.shown(doc[key])}" if key in doc else "is missing"
+            raise FormatError(f'{path}: "{key}" {came}; needed {needed}: copy the whole scan again')
+    listed = doc["files"]
     for name, digest in listed.items():
         if files.check_relative(name) is not None or not (folder / name).is_file():
             raise FormatError(f"{folder}: {files.shown(name)} is missing; scan.json lists it: copy the whole folder")
