@@ -21,6 +21,7 @@ import tifffile
 
 from fringescope import store
 from fringescope.cli import run
+from fringescope.store.files import check_name
 from fringescope.types import FringeSet, Layout, PixelFormat, ViewInput, ViewPlan
 
 W, H = 64, 48
@@ -374,6 +375,34 @@ def test_rigs(
     edit(doc)
     rig.write_text(json.dumps(doc))
     assert says in refused("reconstruct", capture, "--rig", rig, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["scan.json", "cloud.ply", "surface.glb", "Preview.GLB", "view.html", "capture.json",
+                                  "decoded.json", "plan.json"])  # fmt: skip
+def test_a_camera_named_like_a_file_of_ours(
+    capture: Path, rig: Path, tmp_path: Path, refused: Callable[..., str], name: str
+) -> None:
+    says = f'"{name}": is the name of a file that we write'
+    doc = rig_document()
+    doc["cameras"][0]["name"] = name
+    rig.write_text(json.dumps(doc))
+    assert says in refused("patterns", rig, "--out", tmp_path / "out")
+    change(capture, lambda d: d["views"][0].update(camera=name))
+    assert says in refused("decode", capture, "--out", tmp_path / "out")
+    assert says in refused("reconstruct", capture, "--rig", rig, "--out", tmp_path / "out")
+
+
+def test_every_file_beside_a_camera_s_folder_is_no_camera_s_name(capture: Path, tmp_path: Path) -> None:
+    """Whatever the verbs leave beside the folders: a new file of theirs must be refused as a name too."""
+    assert run(["decode", str(capture), "--out", str(tmp_path / "d")]) == 0
+    scan = ["simulate", "plane", "--preset", "single", "--scale", "0.04", "--out", str(tmp_path / "c")]
+    assert run(scan) == 0
+    true = str(tmp_path / "c" / "truth" / "rig.json")
+    assert run(["reconstruct", str(tmp_path / "c"), "--rig", true, "--out", str(tmp_path / "s")]) == 0
+    assert run(["patterns", true, "--out", str(tmp_path / "p")]) == 0
+    beside = {p.name for folder in "dcsp" for p in (tmp_path / folder).iterdir() if p.is_file()}
+    assert {"scan.json", "cloud.ply", "surface.glb", "view.html", "decoded.json", "plan.json"} <= beside
+    assert [n for n in sorted(beside) if check_name(n) is None] == []
 
 
 # ------------------------------------------------------------------------------------------------------------ outputs

@@ -31,6 +31,9 @@ from fringescope.errors import FormatError, OutputError
 
 CAPTURE, SCAN, DECODED, PLAN, BOARD = "capture.json", "scan.json", "decoded.json", "plan.json", "board.json"
 
+#: files that stand beside the cameras' folders in a capture, a scan, a decoded capture or patterns
+BESIDE = frozenset((CAPTURE, SCAN, DECODED, PLAN, "cloud.ply", "surface.glb", "preview.glb", "view.html"))
+
 _REASONS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota of the disk is used up",
@@ -331,6 +334,8 @@ def check_name(name: str) -> str | None:
         return "needed 1 to 100 characters"
     if name in (".", "..") or name != name.strip() or name.endswith("."):
         return "needed a name that a folder can have"
+    if name.casefold() in BESIDE:
+        return "is the name of a file that we write beside the camera's folder; needed another, as in camera1"
     if any(c in '/\\:*?"<>|#' or ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name):
         return "needed letters, digits, - and _ (it names a folder)"
     return None
