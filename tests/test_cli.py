@@ -146,6 +146,42 @@ def test_decode_of_a_bare_stack(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert np.isnan(tifffile.imread(tmp_path / "d/camera1/u.tif")).all()
 
 
+def three_steps(path: Path) -> None:
+    """A stack of one set, wide enough that every pixel has neighbours."""
+    x = np.tile(np.arange(90) * 2 * np.pi / 30, (60, 1))
+    ideal = np.stack([110 + 70 * np.cos(x - 2 * np.pi * n / 3) for n in range(3)])
+    steps = ideal + np.random.default_rng(0).normal(0, 1, ideal.shape)
+    tifffile.imwrite(path, np.rint(steps).astype(np.uint8), photometric="minisblack")
+
+
+def test_a_folder_with_one_stack_is_that_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    three_steps(folder / "a.tif")
+    (folder / "LICENSE.txt").write_text("free")
+    tifffile.imwrite(folder / "photo.tif", np.zeros((60, 90), np.uint8), photometric="minisblack")  # a page is no stack
+    doc = answer(["decode", str(folder), "--out", str(tmp_path / "d")], capsys)
+    same = answer(["decode", str(folder / "a.tif"), "--out", str(tmp_path / "e")], capsys)
+    assert doc["source"] == same["source"] == "a.tif"
+    assert doc["capture"] == same["capture"]
+    assert doc["views"] == same["views"]
+    assert doc["views"][0]["valid"] > 5000
+    three_steps(folder / "b.TIFF")
+    assert run(["decode", str(folder), "--out", str(tmp_path / "f")]) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "no capture.json, and 2 TIFF stacks (a.tif, b.TIFF); needed one" in line
+    (folder / "capture.json").write_text("{}")  # then it is a capture, whatever else lies there
+    assert run(["decode", str(folder), "--out", str(tmp_path / "f")]) == 1
+    assert "capture.json" in capsys.readouterr().err.splitlines()[-1]
+
+
+@needs_shared
+def test_the_folder_of_somebody_s_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    doc = answer(["decode", str(SHARED / "stack-16bit"), "--out", str(tmp_path / "d")], capsys)
+    assert doc["source"] == "ex_stack.tif"
+    assert doc["views"][0]["valid"] > 0.98 * 66 * 114
+
+
 def test_evaluate(scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     doc = answer(["evaluate", str(scan), "--fit", "plane", "--picture", str(tmp_path / "map.png")], capsys)
     assert doc["plane"]["spread"]["std_um"] < 10
