@@ -95,6 +95,15 @@ def test_reconstruct_leaves_a_scan_on_the_true_plane(simulated: Path, scan: Path
     assert back.document["hash"].encode() in glb
 
 
+def test_a_scan_tells_its_times_once(scan: Path) -> None:
+    doc = json.loads((scan / "scan.json").read_text())
+    times = doc["times_s"]
+    assert {"fuse", "mesh"} <= set(times)
+    assert {c for c in ("camera1", "camera2") if any(c in stage for stage in times)} == {"camera1", "camera2"}
+    assert all(t > 0 for t in times.values())
+    assert "times_s" not in doc["figures"]
+
+
 def test_all_points_grids_and_force(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["reconstruct", str(simulated), "--rig", str(simulated / "truth/rig.json"), "--out", str(tmp_path / "s")]
     doc = answer([*args, "--all-points", "--grids", "--no-preview"], capsys)

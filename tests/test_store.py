@@ -407,6 +407,15 @@ def test_scan_comes_back(tmp_path: Path, grids: bool) -> None:
     assert doc["files"]["cloud.ply"] == f"sha256:{sha}"
 
 
+def test_times_of_a_scan_stand_beside_its_figures(tmp_path: Path) -> None:
+    timed = dataclasses.replace(a_scan(), figures={"rms": 1.5, "times_s": {"fuse": np.float64(0.25)}})
+    doc = store.write_scan(
+        tmp_path / "s", timed, settings={}, capture_hash="sha256:1", rig_hash="sha256:2",
+        write_ply=lambda _, path: path.write_bytes(b"ply"), write_glb=lambda *_: None,
+    )  # fmt: skip
+    assert (doc["times_s"], doc["figures"]) == ({"fuse": 0.25}, {"rms": 1.5})
+
+
 def test_a_scan_that_changed_is_refused(tmp_path: Path) -> None:
     write_a_scan(tmp_path / "s")
     with (tmp_path / "s/cloud.ply").open("ab") as f:

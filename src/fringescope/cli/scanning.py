@@ -77,7 +77,6 @@ def scan_into(
             write_ply=export.write_ply,
             write_glb=export.write_glb,
             write_preview=export.write_preview,
-            times_s=progress.times_s,
             grids=grids,
         ),
     )
