@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -19,9 +20,10 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fringescope import store
+from fringescope import geometry, store
 from fringescope.errors import CaptureError, FormatError, OutputError, RigError
 from fringescope.store.images import Images, decode_png, write_png
+from fringescope.twin import presets
 from fringescope.types import (
     Cloud,
     Decoded,
@@ -31,6 +33,7 @@ from fringescope.types import (
     GraySet,
     Grid,
     Layout,
+    Lens,
     NoiseModel,
     PixelFormat,
     Reason,
@@ -275,6 +278,60 @@ def test_a_rig_keeps_the_keys_that_it_does_not_know(tmp_path: Path) -> None:
     store.write_rig(tmp_path / "b.json", rig)
     assert json.loads((tmp_path / "b.json").read_text()) == rig_doc()
     assert store.hash_rig(tmp_path / "a.json") == store.hash_rig(tmp_path / "b.json")
+
+
+def with_lens(path: Path, **camera: Any) -> Path:
+    doc = rig_doc()
+    doc["cameras"][1].update(camera)
+    path.write_text(json.dumps(doc))
+    return path
+
+
+@pytest.mark.parametrize("where", [0.5, 0.97, 1.03])
+@pytest.mark.parametrize("c", [(20.0, 30.0), (31.5, 23.5), (-15.0, 70.0)])
+def test_a_lens_may_fold_beyond_its_picture_and_not_inside(tmp_path: Path, where: float, c: Any) -> None:
+    """By hand: r + k1 r^3 turns back at r = 1 / sqrt(-3 k1), which it images at 2/3 of that."""
+    far = max(np.hypot(x - c[0], y - c[1]) for x in (0, 63) for y in (0, 47))
+    K = [[100.0, 0, c[0]], [0, 100.0, c[1]], [0, 0, 1]]
+    k1 = -4 / 27 / (where * far / 100) ** 2
+    path = with_lens(tmp_path / "a.json", K=K, distortion=[k1, 0, 0, 0, 0])
+    if where > 1:
+        store.read_rig(path)
+        return
+    with pytest.raises(RigError, match=r"camera 'camera2': distortion .*: folds at \(") as e:
+        store.read_rig(path)
+    u, v = map(int, re.findall(r"at \((\d+), (\d+)\)", str(e.value))[0])
+    assert np.hypot(u - c[0], v - c[1]) == pytest.approx(where * far, abs=1.5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.125, 0.04])
+@pytest.mark.parametrize("preset", presets.names())
+def test_the_lenses_of_the_twin_pass(tmp_path: Path, preset: str, scale: float) -> None:
+    for layout in Layout:
+        store.write_rig(tmp_path / f"{layout.value}.json", presets.instrument(preset, scale, layout).rig)
+        store.read_rig(tmp_path / f"{layout.value}.json")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lenses_are_refused_where_pixels_have_no_direction(tmp_path: Path, seed: int) -> None:
+    """Of random lenses, those that fold have pixels that see nothing; gentle ones, which pass, have none."""
+    rng = np.random.default_rng(seed)
+    uv = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), -1)
+    folded = 0
+    for strength in np.repeat([0.01, 2.0], 15):
+        K = np.array([[100.0, 0, rng.uniform(-20, 84)], [0, 100.0, rng.uniform(-20, 68)], [0, 0, 1]])
+        d = strength * rng.normal(size=5) * [1, 1.5, 0.05, 0.05, 1]
+        blind = bool(np.isnan(geometry.unproject(Lens(64, 48, K, d), uv)).any())
+        path = with_lens(tmp_path / "a.json", K=K.tolist(), distortion=d.tolist())
+        told = ""
+        try:
+            store.read_rig(path)
+        except RigError as e:
+            told = str(e)
+        folded += "folds" in told
+        assert blind or "folds" not in told
+        assert not (blind or told) or strength > 1
+    assert folded >= 3
 
 
 @pytest.mark.parametrize(("what", "reader"), [("capture", store.read_capture), ("rig", store.read_rig)])
