@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from fringescope import export, store
+from fringescope import export, geometry, store
 from fringescope.cli import run
+from fringescope.cli.capturing import make_world
 from fringescope.cli.common import Progress, load_settings
+from fringescope.cli.showing import errors
 from fringescope.errors import UsageError
 from fringescope.settings import from_yaml, to_dict
+from fringescope.types import Cloud, Grid, Scan
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/data is absent")
@@ -343,6 +346,35 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path, number: signal.Signal
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_demo_judges_by_the_distance_to_the_surface() -> None:
+    """Points 10 um above balls and plate, at their silhouettes too, are 10 um off; three set aside fly."""
+    world = make_world("sphere", "pair", 0.04, 0, "diamond", 0, "checkerboard")
+    grids, along = [], []
+    balls = world.scene.truth["sphere.json"]["spheres"]
+    for n, camera in enumerate(("camera1", "camera2")):
+        true = world.renderer.truth(camera).xyz
+        normal = np.broadcast_to([0, 0, 1.0], true.shape).copy()
+        for b in balls:
+            on = np.linalg.norm(true - b["center"], axis=-1) < b["radius"] + 1e-6
+            normal[on] = (true[on] - b["center"]) / b["radius"]
+        away = true - geometry.centre(world.instrument.rig.camera(camera).pose)
+        away /= np.linalg.norm(away, axis=-1, keepdims=True)
+        along.append(np.abs(0.01 / (away * normal).sum(-1)))
+        xyz = true + 0.01 * normal
+        xyz[0, 0, 2] += 0.5
+        ok = np.isfinite(true).all(-1)
+        reasons = np.where(ok, 0, 1).astype(np.uint16)
+        grids.append(Grid(n, camera, xyz.astype(np.float32), np.ones(ok.shape, np.float32), reasons))
+    assert max(a.max() for a in along) > 0.1  # what it comes to along the rays
+    empty = Cloud(*(np.zeros((0, 3), t) for t in (np.float32, np.float32, np.uint8)), *(np.zeros(0, np.float32),) * 2)
+    where, error = errors(Scan(tuple(grids), empty, None, (), {}), world)
+    assert len(where) == len(error) == sum(int(g.valid.sum()) for g in grids)
+    flying = np.abs(error) > 200
+    assert flying.sum() == 2
+    np.testing.assert_allclose(error[flying], 510, atol=1)
+    np.testing.assert_allclose(error[~flying], 10, atol=0.1)
+
+
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = [
         "demo",
@@ -363,5 +395,11 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         picture = cv2.imread(str(tmp_path / "d" / name))
         assert picture.std() > 5
     assert doc["error"]["std_um"] < 30
+    assert 0 <= doc["error"]["flying_ppm"] < 2000
+    assert doc["error"]["rms_um"] < 60
+    assert run([*args, "--force"]) == 0
+    told = capsys.readouterr().out
+    assert "against the true surface, along its normal: std " in told
+    assert "of a million points fly, farther than 0.2 mm from it" in told
     assert run(args) == 1
     assert "already holds a demo" in capsys.readouterr().err
