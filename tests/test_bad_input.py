@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ import tifffile
 
 from fringescope import store
 from fringescope.cli import run
+from fringescope.store.files import check_name
 from fringescope.types import FringeSet, Layout, PixelFormat, ViewInput, ViewPlan
 
 W, H = 64, 48
@@ -173,6 +176,33 @@ def test_frames(
     assert "05.png" in line
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes in folders are a POSIX matter")
+@pytest.mark.parametrize("what", ["pipe", "device"])
+@pytest.mark.parametrize("name", ["05.png", "color.png"])
+def test_a_pipe_or_a_device_is_no_frame(
+    capture: Path, rig: Path, tmp_path: Path, refused: Callable[..., str], what: str, name: str
+) -> None:
+    """Opened, a pipe without a writer waits for ever: the run stands aside, so that it can be stopped."""
+    path = capture / "camera1" / name
+    path.unlink(missing_ok=True)
+    if what == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    change(capture, lambda d: d["views"][0].update(color="camera1/color.png") if name == "color.png" else None)
+    told = []
+    for verb, more in (("decode", []), ("reconstruct", ["--rig", rig])):
+        thread = threading.Thread(
+            target=lambda verb=verb, more=more: told.append(refused(verb, capture, *more, "--out", tmp_path / "out")),
+            daemon=True,
+        )
+        thread.start()
+        thread.join(30)
+        assert not thread.is_alive(), f"{verb} hangs"
+    assert len(told) == 2
+    assert all(f"{name}: is a pipe or a device; needed a PNG or TIFF frame" in line for line in told)
+
+
 def test_twelve_bits(tmp_path: Path, refused: Callable[..., str]) -> None:
     store.write_capture(tmp_path / "c", *PLANE, Layout.GRID, [view_input(PixelFormat.MONO12)])
     path = tmp_path / "c/camera1/03.png"
@@ -324,6 +354,12 @@ nan, inf = float("nan"), float("inf")
         (lambda d: d["cameras"][0].update(R=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "rotation"),
         (lambda d: d["cameras"][0].update(t=[0, nan, 0]), "NaN"),
         (lambda d: d["cameras"][0].update(distortion=[0, 0, 0, 0]), "shape"),
+        (lambda d: d["cameras"][0].update(distortion=[1e6] * 5), "camera 'camera1': distortion"),
+        (lambda d: d["projector"].update(distortion=[1e6] * 5), "projector: distortion"),
+        (lambda d: d["cameras"][0].update(distortion=[1e6, 0, 0, 0, 0]), "stretches more than 3 times at ("),
+        (lambda d: d["projector"].update(distortion=[0, 0, 0, 0, 1e6]), "stretches more than 3 times at ("),
+        (lambda d: d["cameras"][0].update(distortion=[0, 0, 0, 1e6, 0]), "folds at ("),
+        (lambda d: d["projector"].update(distortion=[-1e6, 0, 0, 0, 0]), "folds at ("),
         (lambda d: d.update(cameras=[]), "no cameras"),
         (lambda d: d.update(units="m"), "mm"),
         (lambda d: d.update(version=7), "higher"),
@@ -345,6 +381,34 @@ def test_rigs(
     edit(doc)
     rig.write_text(json.dumps(doc))
     assert says in refused("reconstruct", capture, "--rig", rig, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["scan.json", "cloud.ply", "surface.glb", "Preview.GLB", "view.html", "capture.json",
+                                  "decoded.json", "plan.json"])  # fmt: skip
+def test_a_camera_named_like_a_file_of_ours(
+    capture: Path, rig: Path, tmp_path: Path, refused: Callable[..., str], name: str
+) -> None:
+    says = f'"{name}": is the name of a file that we write'
+    doc = rig_document()
+    doc["cameras"][0]["name"] = name
+    rig.write_text(json.dumps(doc))
+    assert says in refused("patterns", rig, "--out", tmp_path / "out")
+    change(capture, lambda d: d["views"][0].update(camera=name))
+    assert says in refused("decode", capture, "--out", tmp_path / "out")
+    assert says in refused("reconstruct", capture, "--rig", rig, "--out", tmp_path / "out")
+
+
+def test_every_file_beside_a_camera_s_folder_is_no_camera_s_name(capture: Path, tmp_path: Path) -> None:
+    """Whatever the verbs leave beside the folders: a new file of theirs must be refused as a name too."""
+    assert run(["decode", str(capture), "--out", str(tmp_path / "d")]) == 0
+    scan = ["simulate", "plane", "--preset", "single", "--scale", "0.04", "--out", str(tmp_path / "c")]
+    assert run(scan) == 0
+    true = str(tmp_path / "c" / "truth" / "rig.json")
+    assert run(["reconstruct", str(tmp_path / "c"), "--rig", true, "--out", str(tmp_path / "s")]) == 0
+    assert run(["patterns", true, "--out", str(tmp_path / "p")]) == 0
+    beside = {p.name for folder in "dcsp" for p in (tmp_path / folder).iterdir() if p.is_file()}
+    assert {"scan.json", "cloud.ply", "surface.glb", "view.html", "decoded.json", "plan.json"} <= beside
+    assert [n for n in sorted(beside) if check_name(n) is None] == []
 
 
 # ------------------------------------------------------------------------------------------------------------ outputs

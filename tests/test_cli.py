@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from fringescope import export, store
+from fringescope import export, geometry, store
 from fringescope.cli import run
+from fringescope.cli.capturing import make_world
 from fringescope.cli.common import Progress, load_settings
+from fringescope.cli.showing import errors
 from fringescope.errors import UsageError
 from fringescope.settings import from_yaml, to_dict
+from fringescope.types import Cloud, Grid, Scan
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/data is absent")
@@ -95,6 +98,15 @@ def test_reconstruct_leaves_a_scan_on_the_true_plane(simulated: Path, scan: Path
     assert back.document["hash"].encode() in glb
 
 
+def test_a_scan_tells_its_times_once(scan: Path) -> None:
+    doc = json.loads((scan / "scan.json").read_text())
+    times = doc["times_s"]
+    assert {"fuse", "mesh"} <= set(times)
+    assert {c for c in ("camera1", "camera2") if any(c in stage for stage in times)} == {"camera1", "camera2"}
+    assert all(t > 0 for t in times.values())
+    assert "times_s" not in doc["figures"]
+
+
 def test_all_points_grids_and_force(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["reconstruct", str(simulated), "--rig", str(simulated / "truth/rig.json"), "--out", str(tmp_path / "s")]
     doc = answer([*args, "--all-points", "--grids", "--no-preview"], capsys)
@@ -144,6 +156,42 @@ def test_decode_of_a_bare_stack(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert np.nanmax(np.abs(error)) < 1e-3
     np.testing.assert_allclose(tifffile.imread(tmp_path / "d/camera1/background.tif"), (I0 + I1 + I2) / 3, rtol=1e-5)
     assert np.isnan(tifffile.imread(tmp_path / "d/camera1/u.tif")).all()
+
+
+def three_steps(path: Path) -> None:
+    """A stack of one set, wide enough that every pixel has neighbours."""
+    x = np.tile(np.arange(90) * 2 * np.pi / 30, (60, 1))
+    ideal = np.stack([110 + 70 * np.cos(x - 2 * np.pi * n / 3) for n in range(3)])
+    steps = ideal + np.random.default_rng(0).normal(0, 1, ideal.shape)
+    tifffile.imwrite(path, np.rint(steps).astype(np.uint8), photometric="minisblack")
+
+
+def test_a_folder_with_one_stack_is_that_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    three_steps(folder / "a.tif")
+    (folder / "LICENSE.txt").write_text("free")
+    tifffile.imwrite(folder / "photo.tif", np.zeros((60, 90), np.uint8), photometric="minisblack")  # a page is no stack
+    doc = answer(["decode", str(folder), "--out", str(tmp_path / "d")], capsys)
+    same = answer(["decode", str(folder / "a.tif"), "--out", str(tmp_path / "e")], capsys)
+    assert doc["source"] == same["source"] == "a.tif"
+    assert doc["capture"] == same["capture"]
+    assert doc["views"] == same["views"]
+    assert doc["views"][0]["valid"] > 5000
+    three_steps(folder / "b.TIFF")
+    assert run(["decode", str(folder), "--out", str(tmp_path / "f")]) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "no capture.json, and 2 TIFF stacks (a.tif, b.TIFF); needed one" in line
+    (folder / "capture.json").write_text("{}")  # then it is a capture, whatever else lies there
+    assert run(["decode", str(folder), "--out", str(tmp_path / "f")]) == 1
+    assert "capture.json" in capsys.readouterr().err.splitlines()[-1]
+
+
+@needs_shared
+def test_the_folder_of_somebody_s_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    doc = answer(["decode", str(SHARED / "stack-16bit"), "--out", str(tmp_path / "d")], capsys)
+    assert doc["source"] == "ex_stack.tif"
+    assert doc["views"][0]["valid"] > 0.98 * 66 * 114
 
 
 def test_evaluate(scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,6 +346,35 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path, number: signal.Signal
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_demo_judges_by_the_distance_to_the_surface() -> None:
+    """Points 10 um above balls and plate, at their silhouettes too, are 10 um off; three set aside fly."""
+    world = make_world("sphere", "pair", 0.04, 0, "diamond", 0, "checkerboard")
+    grids, along = [], []
+    balls = world.scene.truth["sphere.json"]["spheres"]
+    for n, camera in enumerate(("camera1", "camera2")):
+        true = world.renderer.truth(camera).xyz
+        normal = np.broadcast_to([0, 0, 1.0], true.shape).copy()
+        for b in balls:
+            on = np.linalg.norm(true - b["center"], axis=-1) < b["radius"] + 1e-6
+            normal[on] = (true[on] - b["center"]) / b["radius"]
+        away = true - geometry.centre(world.instrument.rig.camera(camera).pose)
+        away /= np.linalg.norm(away, axis=-1, keepdims=True)
+        along.append(np.abs(0.01 / (away * normal).sum(-1)))
+        xyz = true + 0.01 * normal
+        xyz[0, 0, 2] += 0.5
+        ok = np.isfinite(true).all(-1)
+        reasons = np.where(ok, 0, 1).astype(np.uint16)
+        grids.append(Grid(n, camera, xyz.astype(np.float32), np.ones(ok.shape, np.float32), reasons))
+    assert max(a.max() for a in along) > 0.1  # what it comes to along the rays
+    empty = Cloud(*(np.zeros((0, 3), t) for t in (np.float32, np.float32, np.uint8)), *(np.zeros(0, np.float32),) * 2)
+    where, error = errors(Scan(tuple(grids), empty, None, (), {}), world)
+    assert len(where) == len(error) == sum(int(g.valid.sum()) for g in grids)
+    flying = np.abs(error) > 200
+    assert flying.sum() == 2
+    np.testing.assert_allclose(error[flying], 510, atol=1)
+    np.testing.assert_allclose(error[~flying], 10, atol=0.1)
+
+
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = [
         "demo",
@@ -318,5 +395,11 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         picture = cv2.imread(str(tmp_path / "d" / name))
         assert picture.std() > 5
     assert doc["error"]["std_um"] < 30
+    assert 0 <= doc["error"]["flying_ppm"] < 2000
+    assert doc["error"]["rms_um"] < 60
+    assert run([*args, "--force"]) == 0
+    told = capsys.readouterr().out
+    assert "against the true surface, along its normal: std " in told
+    assert "of a million points fly, farther than 0.2 mm from it" in told
     assert run(args) == 1
     assert "already holds a demo" in capsys.readouterr().err

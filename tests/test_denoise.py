@@ -321,7 +321,7 @@ def lossy(**shares):
 @pytest.mark.parametrize(("reason", "part", "advice"), [
     ("SATURATED", 0.06, "halve the exposure"), ("REVERSED", 0.02, "dry the surface"),
     ("VIEWS_DISAGREE", 0.05, "calibrate anew"), ("OUT_OF_VOLUME", 0.2, "measuring volume"),
-    ("ORDER_UNCERTAIN", 0.1, "coarse fringes"), ("INCONSISTENT", 0.05, "out of order"),
+    ("ORDER_UNCERTAIN", 0.1, "orders left open"), ("INCONSISTENT", 0.05, "out of order"),
     ("LOW_MODULATION", 0.9, "expose longer"),
 ])  # fmt: skip
 def test_the_verdict_names_the_camera_the_share_and_what_to_do(reason, part, advice):
@@ -340,9 +340,27 @@ def test_the_verdict_is_quiet_about_what_is_usual():
     assert v.words == ("camera2: 4790 points on 5000 pixels with fringes of 10000",)
 
 
-def test_shares_are_of_the_lit_pixels():
+def test_shares_are_of_the_lit_pixels_and_say_so():
     v = denoise.verdict(lossy(DARK=0.5, SATURATED=0.03))
-    assert any("6.0 % saturated" in w for w in v.words)
+    assert any("6.0 % of the pixels with fringes: saturated; " in w for w in v.words)
+
+
+@pytest.mark.parametrize(("reason", "part", "told"), [("DARK", 0.98, "98.0"), ("LOW_MODULATION", 0.9, "90.0")])
+def test_shares_of_pixels_without_fringes_are_of_all_and_say_so(reason, part, told):
+    v = denoise.verdict(lossy(**{reason: part}, JUMP=0.01))
+    (weak,) = [w for w in v.words if Reason[reason].label in w]
+    assert weak.startswith(f"camera2: {told} % of all pixels: {Reason[reason].label}; ")
+    (jump,) = [w for w in v.words if Reason.JUMP.label in w]
+    share = 100 * 0.01 / (1 - part)
+    assert jump.startswith(f"camera2: {share:.1f} % of the pixels with fringes: phase jump; ")
+
+
+def test_what_to_do_about_open_orders_is_true_for_every_set():
+    """Gray codes and heterodyne sets leave orders open too, where no coarse fringe is too noisy."""
+    (told,) = [w for w in denoise.verdict(lossy(ORDER_UNCERTAIN=0.1)).words if "order uncertain" in w]
+    assert "noisy" not in told
+    assert "phase.systematic_rad" in told
+    assert hasattr(PhaseSettings(), "systematic_rad")
 
 
 def test_the_verdict_of_a_black_view():

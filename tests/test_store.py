@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -19,9 +20,10 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fringescope import store
+from fringescope import geometry, store
 from fringescope.errors import CaptureError, FormatError, OutputError, RigError
 from fringescope.store.images import Images, decode_png, write_png
+from fringescope.twin import presets
 from fringescope.types import (
     Cloud,
     Decoded,
@@ -31,6 +33,7 @@ from fringescope.types import (
     GraySet,
     Grid,
     Layout,
+    Lens,
     NoiseModel,
     PixelFormat,
     Reason,
@@ -277,6 +280,60 @@ def test_a_rig_keeps_the_keys_that_it_does_not_know(tmp_path: Path) -> None:
     assert store.hash_rig(tmp_path / "a.json") == store.hash_rig(tmp_path / "b.json")
 
 
+def with_lens(path: Path, **camera: Any) -> Path:
+    doc = rig_doc()
+    doc["cameras"][1].update(camera)
+    path.write_text(json.dumps(doc))
+    return path
+
+
+@pytest.mark.parametrize("where", [0.5, 0.97, 1.03])
+@pytest.mark.parametrize("c", [(20.0, 30.0), (31.5, 23.5), (-15.0, 70.0)])
+def test_a_lens_may_fold_beyond_its_picture_and_not_inside(tmp_path: Path, where: float, c: Any) -> None:
+    """By hand: r + k1 r^3 turns back at r = 1 / sqrt(-3 k1), which it images at 2/3 of that."""
+    far = max(np.hypot(x - c[0], y - c[1]) for x in (0, 63) for y in (0, 47))
+    K = [[100.0, 0, c[0]], [0, 100.0, c[1]], [0, 0, 1]]
+    k1 = -4 / 27 / (where * far / 100) ** 2
+    path = with_lens(tmp_path / "a.json", K=K, distortion=[k1, 0, 0, 0, 0])
+    if where > 1:
+        store.read_rig(path)
+        return
+    with pytest.raises(RigError, match=r"camera 'camera2': distortion .*: folds at \(") as e:
+        store.read_rig(path)
+    u, v = map(int, re.findall(r"at \((\d+), (\d+)\)", str(e.value))[0])
+    assert np.hypot(u - c[0], v - c[1]) == pytest.approx(where * far, abs=1.5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.125, 0.04])
+@pytest.mark.parametrize("preset", presets.names())
+def test_the_lenses_of_the_twin_pass(tmp_path: Path, preset: str, scale: float) -> None:
+    for layout in Layout:
+        store.write_rig(tmp_path / f"{layout.value}.json", presets.instrument(preset, scale, layout).rig)
+        store.read_rig(tmp_path / f"{layout.value}.json")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lenses_are_refused_where_pixels_have_no_direction(tmp_path: Path, seed: int) -> None:
+    """Of random lenses, those that fold have pixels that see nothing; gentle ones, which pass, have none."""
+    rng = np.random.default_rng(seed)
+    uv = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), -1)
+    folded = 0
+    for strength in np.repeat([0.01, 2.0], 15):
+        K = np.array([[100.0, 0, rng.uniform(-20, 84)], [0, 100.0, rng.uniform(-20, 68)], [0, 0, 1]])
+        d = strength * rng.normal(size=5) * [1, 1.5, 0.05, 0.05, 1]
+        blind = bool(np.isnan(geometry.unproject(Lens(64, 48, K, d), uv)).any())
+        path = with_lens(tmp_path / "a.json", K=K.tolist(), distortion=d.tolist())
+        told = ""
+        try:
+            store.read_rig(path)
+        except RigError as e:
+            told = str(e)
+        folded += "folds" in told
+        assert blind or "folds" not in told
+        assert not (blind or told) or strength > 1
+    assert folded >= 3
+
+
 @pytest.mark.parametrize(("what", "reader"), [("capture", store.read_capture), ("rig", store.read_rig)])
 @pytest.mark.parametrize(("version", "says"), [(2, "higher"), *((v, "version") for v in (0, "1", None, True))])
 def test_versions(tmp_path: Path, what: str, reader: Any, version: Any, says: str) -> None:
@@ -287,6 +344,38 @@ def test_versions(tmp_path: Path, what: str, reader: Any, version: Any, says: st
     path.write_text(json.dumps({"format": "something", "version": 1}))
     with pytest.raises(FormatError, match="something"):
         reader(path)
+
+
+@pytest.mark.parametrize(("what", "reader"), [
+    ("capture", store.read_capture), ("rig", store.read_rig), ("scan", store.read_scan),
+    ("response", store.read_response),
+])  # fmt: skip
+@pytest.mark.parametrize("key", ["format", "version"])
+def test_a_missing_key_is_called_missing(tmp_path: Path, what: str, reader: Any, key: str) -> None:
+    doc = {"format": f"fringescope-{what}", "version": 1}
+    del doc[key]
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(doc))
+    with pytest.raises(FormatError, match=f'x.json: "{key}" is missing; needed') as e:
+        reader(path)
+    assert "null" not in str(e.value)
+    path.write_text(json.dumps(doc | {key: None}))
+    with pytest.raises(FormatError, match=f'"{key}" is null; needed'):
+        reader(path)
+
+
+@pytest.mark.parametrize("key", ["files", "views"])
+def test_a_scan_without_its_lists_says_which(tmp_path: Path, key: str) -> None:
+    write_a_scan(tmp_path / "s")
+    path = tmp_path / "s" / "scan.json"
+    doc = json.loads(path.read_text())
+    path.write_text(json.dumps(doc | {key: 7}))
+    with pytest.raises(FormatError, match=f'"{key}" is 7; needed'):
+        store.read_scan(tmp_path / "s")
+    del doc[key]
+    path.write_text(json.dumps(doc))
+    with pytest.raises(FormatError, match=f'"{key}" is missing; needed'):
+        store.read_scan(tmp_path / "s")
 
 
 # -------------------------------------------------------------------------------------------------------------- scans
@@ -373,6 +462,15 @@ def test_scan_comes_back(tmp_path: Path, grids: bool) -> None:
         assert tifffile.imread(tmp_path / "s/camera2/xyz.tif").shape == (6, 9, 3)
     sha = hashlib.sha256((tmp_path / "s/cloud.ply").read_bytes()).hexdigest()
     assert doc["files"]["cloud.ply"] == f"sha256:{sha}"
+
+
+def test_times_of_a_scan_stand_beside_its_figures(tmp_path: Path) -> None:
+    timed = dataclasses.replace(a_scan(), figures={"rms": 1.5, "times_s": {"fuse": np.float64(0.25)}})
+    doc = store.write_scan(
+        tmp_path / "s", timed, settings={}, capture_hash="sha256:1", rig_hash="sha256:2",
+        write_ply=lambda _, path: path.write_bytes(b"ply"), write_glb=lambda *_: None,
+    )  # fmt: skip
+    assert (doc["times_s"], doc["figures"]) == ({"fuse": 0.25}, {"rms": 1.5})
 
 
 def test_a_scan_that_changed_is_refused(tmp_path: Path) -> None:

@@ -122,6 +122,37 @@ def test_ray_hits_on_analytic_shapes_lie_on_them():
     assert (q < box.high[0] + 1e-9).all()
 
 
+@pytest.mark.parametrize("name", ["plane", "sphere", "steps", "board", "tissue-domed", "tissue-thin"])
+def test_offsets_are_distances_from_what_rays_hit(name):
+    """Points set off from where rays end: above is positive, and beside no edge the distance is the step."""
+    made, rng = scene.make(name), np.random.default_rng(5)
+    ends = np.column_stack([rng.uniform([-34, -20], [34, 20], (4000, 2)), np.zeros(4000)])
+    eye = np.array([40.0, 30.0, 500.0])
+    away = (ends - eye) / np.linalg.norm(ends - eye, axis=1, keepdims=True)
+    hits = shapes.trace(made.shapes, eye, away)
+    assert (hits.shape >= 0).all()
+    assert np.abs(shapes.offsets(made.shapes, hits.point)).max() < 1e-9
+    normal = hits.normal * np.where((hits.normal * away).sum(1, keepdims=True) < 0, 1, -1)
+    for h in (0.05, 1e-3):
+        up = shapes.offsets(made.shapes, hits.point + h * normal)
+        down = shapes.offsets(made.shapes, hits.point - h * normal)
+        assert np.median(up) == pytest.approx(h, rel=2e-3)
+        assert np.median(down) == pytest.approx(-h, rel=2e-3)
+        assert np.mean(np.abs(up - h) < 0.05 * h) > (0.9 if "tissue" in name else 0.98)
+    assert (shapes.offsets(made.shapes, hits.point + np.array([0, 0, 3.0])) > -1e-9).all()  # a wall goes on upwards
+
+
+def test_offsets_beyond_an_edge_are_from_the_edge():
+    sheet = shapes.Plane(WHITE, x_range=(-10.0, 10.0), y_range=(-5.0, 5.0))
+    box = shapes.Boxes(WHITE, np.array([[-1.0, -1, -1]]), np.array([[1.0, 1, 1]]))
+    p = np.array([[13.0, 9.0, 0.0], [13.0, 0.0, 4.0], [13.0, 0.0, -4.0], [0.0, 0.0, 2.0]])
+    np.testing.assert_allclose(sheet.offset(p), [5, 5, -5, 2])
+    q = np.array([[4.0, 5.0, 0.0], [0.0, 0.0, 3.0], [0.2, 0.0, 0.5]])
+    np.testing.assert_allclose(box.offset(q), [5, 2, -0.5])
+    over = Pose(np.diag([1.0, -1, -1]), np.zeros(3))  # a board's z goes into it: above is still where z grows
+    np.testing.assert_allclose(dataclasses.replace(sheet, pose=over).offset(p[3:]), [2])
+
+
 def test_mesh_hits_agree_with_an_analytic_plane_and_a_brute_force_search():
     rng = np.random.default_rng(3)
     x, y = np.meshgrid(np.linspace(-10, 10, 7), np.linspace(-8, 8, 6))

@@ -304,7 +304,8 @@ def verdict(grid: Grid, alike: bool = False) -> ViewVerdict:
         weak = reason in (Reason.DARK, Reason.LOW_MODULATION)
         part = float(hit.sum()) / n if weak else float((hit & ~without).sum()) / max(lit, 1)
         if part > share:
-            words.append(f"{grid.camera}: {100 * part:.1f} % {reason.label}: {advice}")
+            base = "all pixels" if weak else "the pixels with fringes"
+            words.append(f"{grid.camera}: {100 * part:.1f} % of {base}: {reason.label}; {advice}")
     if alike:
         words.append(
             f"{grid.camera}: its pixels were interpolated from their neighbours, whose errors are thus alike: sigma is "
@@ -318,7 +319,11 @@ _ADVICE = (
     (Reason.DARK, 0.97, "no fringes reached this view: check lens cap, trigger and projector"),
     (Reason.SATURATED, 0.01, "halve the exposure, or add a shorter bracket"),
     (Reason.LOW_MODULATION, 0.8, "hardly any fringes: expose longer, refocus, or bring the specimen into the light"),
-    (Reason.ORDER_UNCERTAIN, 0.02, "the coarse fringes are too noisy: add a set between, or light"),
+    (
+        Reason.ORDER_UNCERTAIN,
+        0.02,
+        "orders left open: add a coarser or intermediate set, or light; pure fringes may lower phase.systematic_rad",
+    ),
     (Reason.REVERSED, 0.005, "mirrored fringes: dry the surface or put something dark below it"),
     (Reason.JUMP, 0.05, "edges and steep walls: turn the specimen"),
     (Reason.ISLAND, 0.02, "crumbs without neighbours: raise the exposure, or lower denoise.island_share"),

@@ -77,7 +77,6 @@ def scan_into(
             write_ply=export.write_ply,
             write_glb=export.write_glb,
             write_preview=export.write_preview,
-            times_s=progress.times_s,
             grids=grids,
         ),
     )
@@ -159,7 +158,8 @@ def _pictures(d: Decoded) -> dict[str, U8]:
 @app.command()
 def decode(
     capture: Annotated[
-        Path, typer.Argument(metavar="CAPTURE_OR_STACK", help="A capture folder, or a TIFF stack of one set.")
+        Path,
+        typer.Argument(metavar="CAPTURE_OR_STACK", help="A capture folder, or a TIFF stack of one set, or its folder."),
     ],
     out: Out,
     steps: Annotated[
@@ -187,14 +187,14 @@ def decode(
     with store.new_folder(out, marker="decoded.json", force=force) as tmp, Progress() as progress:
         views: Sequence[ViewInput]
         extra: dict[str, Any] = {}
-        if capture.is_file() and capture.suffix.lower() in (".tif", ".tiff"):
+        if (stack := importing.the_stack(capture)) is not None:
             if only:
                 raise UsageError(f"--view {only[0]}: a stack has one view; leave the option out")
             if response is not None:
                 raise UsageError("--response is for captures; a bare stack has no period that it could be applied to")
             n = None if steps is None else numbers(steps, "--steps", int)[0]
-            view, note, digest = importing.stack_view(capture, n, axis, time, pixel_format(pixel_format_))
-            views, extra = (view,), {"source": capture.name, "note": note}
+            view, note, digest = importing.stack_view(stack, n, axis, time, pixel_format(pixel_format_))
+            views, extra = (view,), {"source": stack.name, "note": note}
             s = from_dict({"denoise": {"jump_floor_rad": 7.0}}, s)  # a wrapped phase jumps by design
         elif (steps, axis, time, pixel_format_) != (None,) * 4:
             raise UsageError("--steps, --axis, --time, --pixel-format are for a TIFF stack; a capture says them itself")

@@ -9,7 +9,16 @@ from typing import Any
 
 from fringescope import store
 from fringescope.errors import CaptureError, UsageError
-from fringescope.importing.loose import LOSSY, Gray, LooseFrames, Recipe, RecipeFrames, image_files, stack_pages
+from fringescope.importing.loose import (
+    LOSSY,
+    Gray,
+    LooseFrames,
+    Recipe,
+    RecipeFrames,
+    image_files,
+    stack_pages,
+    the_stack,
+)
 from fringescope.importing.order import Evidence, look
 from fringescope.importing.preview import draw
 from fringescope.types import PixelFormat, ViewInput
@@ -25,6 +34,7 @@ __all__ = [
     "look",
     "put_import",
     "stack_view",
+    "the_stack",
 ]
 
 ONE_FRINGE = 1000  #: period given to a stack's only set; the field is a little shorter, so that no order is in doubt

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from fringescope.errors import CaptureError, UsageError
+from fringescope.store.files import CAPTURE
 from fringescope.store.images import Images, check_frame, quiet, stack_axes
 from fringescope.types import (
     AnyArray,
@@ -227,6 +228,23 @@ class Stack:
     path: Path
     names: tuple[str, ...]
     note: str
+
+
+def the_stack(path: Path) -> Path | None:
+    """The TIFF stack that somebody means: the file itself, or the only stack in a folder without capture.json.
+
+    None where there is none: `path` is a capture, or nothing. Raises CaptureError where the folder holds several.
+    """
+    if not path.is_dir():
+        return path if path.suffix.lower() in (".tif", ".tiff") else None
+    if (path / CAPTURE).exists():
+        return None
+    tiffs = [p for p in image_files(path) if p.suffix.lower() in (".tif", ".tiff")]
+    stacks = [p for p in tiffs if stack_axes(p)[1] > 1]
+    if len(stacks) > 1:
+        names = ", ".join(p.name for p in stacks[:8]) + (" .." if len(stacks) > 8 else "")
+        raise CaptureError(f"{path}: no {CAPTURE}, and {len(stacks)} TIFF stacks ({names}); needed one: name its file")
+    return stacks[0] if stacks else None
 
 
 def stack_pages(path: Path, needed: int | None, axis: str | None, time: int | None) -> Stack:

@@ -31,6 +31,9 @@ from fringescope.errors import FormatError, OutputError
 
 CAPTURE, SCAN, DECODED, PLAN, BOARD = "capture.json", "scan.json", "decoded.json", "plan.json", "board.json"
 
+#: files that stand beside the cameras' folders in a capture, a scan, a decoded capture or patterns
+BESIDE = frozenset((CAPTURE, SCAN, DECODED, PLAN, "cloud.ply", "surface.glb", "preview.glb", "view.html"))
+
 _REASONS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota of the disk is used up",
@@ -282,10 +285,13 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def check_format(doc: Mapping[str, Any], path: Path, format_: str, version: int) -> None:
-    """Refuses another `format` and a higher `version`. Raises FormatError."""
-    if doc.get("format") != format_:
-        raise FormatError(f'{path}: "format" is {shown(doc.get("format"))}; needed "{format_}"')
-    v = doc.get("version")
+    """Refuses another `format` and a higher `version`, and a file without them. Raises FormatError."""
+    for key, needed in (("format", f'"{format_}"'), ("version", f"a whole number from 1 to {version}")):
+        if key not in doc:
+            raise FormatError(f'{path}: "{key}" is missing; needed {needed}: add it, or give another file')
+    if doc["format"] != format_:
+        raise FormatError(f'{path}: "format" is {shown(doc["format"])}; needed "{format_}"')
+    v = doc["version"]
     if isinstance(v, bool) or not isinstance(v, int) or v < 1:
         raise FormatError(f'{path}: "version" is {shown(v)}; needed a whole number from 1 to {version}')
     if v > version:
@@ -328,6 +334,8 @@ def check_name(name: str) -> str | None:
         return "needed 1 to 100 characters"
     if name in (".", "..") or name != name.strip() or name.endswith("."):
         return "needed a name that a folder can have"
+    if name.casefold() in BESIDE:
+        return "is the name of a file that we write beside the camera's folder; needed another, as in camera1"
     if any(c in '/\\:*?"<>|#' or ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name):
         return "needed letters, digits, - and _ (it names a folder)"
     return None

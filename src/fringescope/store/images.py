@@ -11,6 +11,7 @@ import hashlib
 import io
 import logging
 import re
+import stat
 import struct
 import threading
 import zlib
@@ -85,6 +86,17 @@ def quiet() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
+def _regular(path: Path) -> None:
+    """Refuses what is there but no file, before it is opened: a pipe would wait for ever. Raises CaptureError."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # who opens it says why
+    if not stat.S_ISREG(mode):
+        came = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise CaptureError(f"{path}: is {came}; needed a PNG or TIFF frame: copy the file itself there")
+
+
 class Images:
     """The image files of one folder, read one at a time; keeps each file's sha256 as it goes by.
 
@@ -98,12 +110,11 @@ class Images:
 
     def _bytes(self, file: str) -> bytes:
         path = self.folder / file
+        _regular(path)
         try:
             data = path.read_bytes()
         except FileNotFoundError:
             raise CaptureError(f"{path}: frame is missing; capture.json names it") from None
-        except IsADirectoryError:
-            raise CaptureError(f"{path}: is a folder; needed a PNG or TIFF frame") from None
         except (OSError, ValueError) as e:
             raise CaptureError(f"{path}: cannot read: {getattr(e, 'strerror', None) or e}") from e
         if not data:
@@ -122,6 +133,7 @@ class Images:
         """What the frame `name` says of itself, without decoding it. Raises CaptureError if it is no PNG or TIFF."""
         file, page = split_page(name)
         path = self.folder / file
+        _regular(path)
         try:
             with path.open("rb") as f:
                 start = f.read(33)
@@ -201,6 +213,7 @@ def stack_axes(path: Path) -> tuple[dict[str, int], int]:
 
     Raises CaptureError if it is no TIFF.
     """
+    _regular(path)
     try:
         with _strict(), tifffile.TiffFile(path) as tif:
             series = tif.series[0]

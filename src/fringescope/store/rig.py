@@ -7,6 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar, cast
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fringescope.errors import FormatError, RigError
@@ -18,6 +19,7 @@ M = TypeVar("M", bound=BaseModel)
 FORMAT, VERSION = "fringescope-rig", 1
 LARGEST = 1e7  #: no number of a rig is larger: mm, pixels, distortion
 SHORTEST = 1e-2  #: pixels, focal length
+STEEPEST = 3.0  #: distortion stretches no place of a picture more than this; lenses as they are built stay below 2
 
 
 class _Model(BaseModel):
@@ -150,7 +152,45 @@ def _lens(d: _Device, width: int, height: int) -> Lens:
     lens = Lens(width, height, _np(d.K), _np(d.distortion))
     if min(lens.K[0, 0], lens.K[1, 1]) < SHORTEST:
         raise RigError(f"K: focal lengths {lens.K[0, 0]:g}, {lens.K[1, 1]:g} pixels; needed at least {SHORTEST:g}")
+    _check_distortion(lens)
     return lens
+
+
+def _check_distortion(lens: Lens) -> None:
+    """Refuses a lens that images two directions, or hardly any, in one place of its own picture. Raises RigError.
+
+    Follows straight lines from the axis towards the picture's edge, as far as the derivative of OpenCV's five-term
+    model is positive definite: a lens may fold beyond its picture.
+    """
+    W, H, K, (k1, k2, p1, p2, k3) = lens.width, lens.height, lens.K, lens.distortion
+    along, zero = np.linspace(0.0, 1.0, 33), np.zeros(33)
+    edge = np.concatenate([[along, zero], [along, zero + 1], [zero, along], [zero + 1, along]], axis=1)
+    y = (edge[1] * (H - 1) - K[1, 2]) / K[1, 1]
+    x = (edge[0] * (W - 1) - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    r = np.hypot(x, y)
+    far = r > 0
+    steps = r.max(initial=1e-12) * np.geomspace(1e-9, 1e2, 600)
+    x, y = x[far, None] / r[far, None] * steps, y[far, None] / r[far, None] * steps
+    r2 = steps * steps
+    c = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    d = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    u = c * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = c * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    u, v = K[0, 0] * u + K[0, 1] * v + K[0, 2], K[1, 1] * v + K[1, 2]
+    uu, uv = c + x * x * d + 2 * p1 * y + 6 * p2 * x, x * y * d + 2 * (p1 * x + p2 * y)
+    vv = c + y * y * d + 6 * p1 * y + 2 * p2 * x
+    middle, swing = (uu + vv) / 2, np.hypot((uu - vv) / 2, uv)
+    inside = (u >= 0) & (u <= W - 1) & (v >= 0) & (v <= H - 1)
+    folds = middle - swing <= 0
+    times = np.cumsum(folds, axis=1)
+    steep = (times == 0) & (middle + swing > STEEPEST)
+    for wrong, what in ((folds & (times == 1), "folds"), (steep, f"stretches more than {STEEPEST:g} times")):
+        if (wrong & inside).any():
+            i = int(np.where(wrong & inside, steps, np.inf).argmin())
+            raise RigError(
+                f"distortion {lens.distortion.tolist()}: {what} at ({u.flat[i]:.0f}, {v.flat[i]:.0f}) of its "
+                f"picture, {W} x {H}; needed one place per direction: calibrate anew, or mend distortion or K"
+            )
 
 
 def _pose(d: _Device) -> Pose:

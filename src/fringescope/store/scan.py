@@ -90,16 +90,15 @@ def put_scan(
     write_ply: WritePly,
     write_glb: WriteGlb,
     write_preview: WriteGlb | None = None,
-    times_s: Mapping[str, float] | None = None,
     grids: bool = False,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Writes a scan into an existing folder and returns its scan.json.
 
     `scan.all_points`, where there is one, takes the place of the fused cloud in cloud.ply. `grids` writes the organised
-    grids as TIFF and PNG, else as .npy. `write_preview` writes the small level, preview.glb. `extra` adds
-    keys to scan.json. "hash" identifies the scan: sha256 over the hashes of capture and rig, settings, program version
-    and cloud.ply; the GLB carries it in `asset.extras`.
+    grids as TIFF and PNG, else as .npy. `write_preview` writes the small level, preview.glb. `extra` adds keys to
+    scan.json; `scan.figures["times_s"]` stands beside its "figures". "hash" identifies the scan: sha256 over the hashes
+    of capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
     """
     cloud = scan.cloud if scan.all_points is None else scan.all_points
     write_ply(cloud, folder / "cloud.ply")
@@ -147,8 +146,8 @@ def put_scan(
             for g in scan.grids
         ],
         "filters": plain(scan.figures.get("filters", [])),
-        "figures": plain(scan.figures),
-        "times_s": plain(times_s or {}),
+        "figures": {k: v for k, v in plain(scan.figures).items() if k != "times_s"},
+        "times_s": plain(scan.figures.get("times_s", {})),
         "settings": plain(settings),
         "files": digests,
         **plain(extra or {}),
@@ -190,9 +189,11 @@ def read_scan(folder: Path | str, *, grids: bool = True, check: bool = True) -> 
     doc = files.read_json(path, "a scan (a folder with scan.json)")
     files.check_format(doc, path, FORMAT, VERSION)
     folder = path.parent
-    listed = doc.get("files")
-    if not isinstance(listed, dict) or not isinstance(doc.get("views"), list):
-        raise FormatError(f'{path}: needed "files" and "views"')
+    for key, kind, needed in (("files", dict, "an object {...}"), ("views", list, "a list [...]")):
+        if not isinstance(doc.get(key), kind):
+            came = f"is {files.shown(doc[key])}" if key in doc else "is missing"
+            raise FormatError(f'{path}: "{key}" {came}; needed {needed}: copy the whole scan again')
+    listed = doc["files"]
     for name, digest in listed.items():
         if files.check_relative(name) is not None or not (folder / name).is_file():
             raise FormatError(f"{folder}: {files.shown(name)} is missing; scan.json lists it: copy the whole folder")

@@ -37,12 +37,21 @@ class Shape(Protocol):
         """Whether something lies within `reach` (n,) of the origins."""
         ...
 
+    def offset(self, points: F64) -> F64:
+        """Distances (n,) mm of world points (n, 3) from the surface, positive above or outside; inf = no surface there.
+        """
+        ...
+
 
 class _Analytic(ABC):
     """Shadow by intersection."""
 
     @abstractmethod
     def hit(self, origins: F64, directions: F64) -> tuple[F64, F64]:
+        """See `Shape`."""
+
+    @abstractmethod
+    def offset(self, points: F64) -> F64:
         """See `Shape`."""
 
     def blocks(self, origins: F64, directions: F64, reach: F64) -> Bool:
@@ -79,6 +88,13 @@ class Plane(_Analytic):
             ok &= (p[:, 1] >= self.y_range[0]) & (p[:, 1] <= self.y_range[1])
         return np.where(ok, t, np.inf), np.where(along[:, None] < 0, 1.0, -1.0) * normal
 
+    def offset(self, points: F64) -> F64:
+        """See `Shape`: above is where z of the world grows."""
+        p = self.local(points)
+        beside = p[:, 0] - np.clip(p[:, 0], *self.x_range), p[:, 1] - np.clip(p[:, 1], *self.y_range)
+        away = np.sqrt(p[:, 2] ** 2 + beside[0] ** 2 + beside[1] ** 2)
+        return np.asarray(np.where((p[:, 2] < 0) == (self.pose.R[2, 2] < 0), away, -away))
+
 
 @dataclass(frozen=True, eq=False)
 class Sphere(_Analytic):
@@ -107,6 +123,10 @@ class Sphere(_Analytic):
                 np.isfinite(t)[:, None], (o + np.where(np.isfinite(t), t, 0)[:, None] * directions) / self.radius, 0
             )
         return t, n
+
+    def offset(self, points: F64) -> F64:
+        """See `Shape`."""
+        return np.asarray(np.linalg.norm(self.local(points), axis=1) - self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +160,16 @@ class Boxes(_Analytic):
             n[rows, axis] = -np.sign(d[rows, axis])
             normal = np.where(ok[:, None], n, normal)
         return best, normal @ self.pose.R.T
+
+    def offset(self, points: F64) -> F64:
+        """See `Shape`: of the nearest box, whatever the others hide of it."""
+        p = self.local(points)
+        out = np.full(len(p), np.inf)
+        for low, high in zip(self.low, self.high, strict=True):
+            q = np.maximum(low - p, p - high)
+            d = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+            out = np.where(np.abs(d) < np.abs(out), d, out)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +212,17 @@ class Mesh:
         )
         return np.asarray(found == 0)
 
+    def offset(self, points: F64) -> F64:
+        """See `Shape`: from the plane of the triangle that lies straight below or above, as of a height field."""
+        top = float(self.vertices[:, 2].max()) + 1.0
+        above = np.column_stack([points[:, :2], np.full(len(points), top)])
+        down = np.broadcast_to([0.0, 0.0, -1.0], above.shape)
+        found = self._scene().run(above.astype(np.float32), down.astype(np.float32))
+        a, b, c = (self.vertices[self.faces[found, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) * np.where(normal[:, 2:] < 0, -1.0, 1.0)
+        return np.where(found < 0, np.inf, np.einsum("ij,ij->i", points - a, normal))
+
 
 @dataclass(frozen=True, eq=False)
 class Hits:
@@ -206,6 +247,12 @@ def trace(shapes: tuple[Shape, ...], origins: F64, directions: F64) -> Hits:
         normal[nearer] = n[nearer]
     point = o + np.where(which >= 0, best, 0.0)[:, None] * directions
     return Hits(which, best, point, normal)
+
+
+def offsets(shapes: tuple[Shape, ...], points: F64) -> F64:
+    """Distances (n,) mm of points (n, 3) from the nearest of the surfaces, positive above or outside it."""
+    every = np.stack([s.offset(points) for s in shapes])
+    return np.asarray(np.take_along_axis(every, np.abs(every).argmin(0)[None], 0)[0])
 
 
 def lit(shapes: tuple[Shape, ...], points: F64, normals: F64, light: F64) -> Bool:
