@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fringescope.kernels import regions, screens
+from fringescope.kernels import fringes, regions, screens
 
 FIELD = np.dstack([np.ones((2, 2, 2)), np.full((2, 2, 1), 0.25)])
 
@@ -66,3 +66,30 @@ def test_masked_pixels_ask_for_all_around_them(rng, hole):
     screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, asked)
     assert asked[18:23, :5].all()
     assert asked[2:-2, 10:-2].mean() < 0.05
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([(40, 60), (9, 700), (6, 5), (3, 3), (30, 517)]), st.integers(1, 3))
+def test_orders_that_are_not_asked_would_not_change(seed, shape, radius):
+    rng = np.random.default_rng(seed)
+    p, _, reasons = surface(rng, shape, outliers=0.0)
+    p += (2 * np.pi * (rng.random(shape) < 0.02) * rng.integers(-3, 4, shape)).astype(np.float32)
+    voters = np.where(reasons == 0, p, np.float32(np.nan))
+    asked, everywhere = np.empty(shape, bool), np.ones(shape, bool)
+    screens.torn_orders(voters, radius, 0.99 * np.pi, asked)
+    out, changed = np.empty_like(p), np.zeros(shape, np.int8)
+    fringes.order_votes(p, voters, everywhere, radius, 3, 0.7, 1.2, out, changed)
+    calm = ~asked & (reasons == 0)
+    np.testing.assert_array_equal(out[calm], p[calm])
+    assert np.isin(changed[calm], (0, 127)).all()
+
+
+def test_calm_orders_are_not_asked(rng):
+    p, _, _ = surface(rng, (60, 900), outliers=0.0, masked=0.0)
+    asked = np.empty(p.shape, bool)
+    screens.torn_orders(p, 2, 0.99 * np.pi, asked)
+    assert not asked.any()
+    p[30, 512] += 2 * np.pi
+    screens.torn_orders(p, 2, 0.99 * np.pi, asked)
+    assert asked.sum() == 25
+    assert asked[28:33, 510:515].all()

@@ -24,7 +24,8 @@ def gradient_signs(phase, sigma, reasons, field, reach, significance):
     full = spread(field, (H, W))
     out = np.zeros((H, W), int)
     for i, j in np.argwhere(reasons == 0):
-        du, dv = full[i, j, :2] / np.linalg.norm(full[i, j, :2])
+        at = full[i, j // 8 * 8, :2]  # the direction is that of the strip's first pixel
+        du, dv = at / np.linalg.norm(at)
         dx, dy = int(np.rint(reach * du)), int(np.rint(reach * dv))
         ends = []
         for y, x in ((i + dy, j + dx), (i - dy, j - dx)):

@@ -8,6 +8,8 @@ from numba import njit
 from fringescope.kernels.lens import to_plane
 from fringescope.threads import by_rows
 
+STRIP = 8  #: pixels of a row for which the predicted direction is taken at their first
+
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _spread(field, i, j, H, W, c):
@@ -35,17 +37,20 @@ def gradient_signs(first, last, phase, sigma, reasons, field, reach, significanc
     """
     H, W = phase.shape
     for i in range(first, last):
+        strip = -1
+        x = y = 0
         for j in range(W):
             out[i, j] = 0
             if reasons[i, j] != 0:
                 continue
-            du = _spread(field, i, j, H, W, 0)
-            dv = _spread(field, i, j, H, W, 1)
-            n = math.hypot(du, dv)
-            if not n > 0.0:
+            if j // STRIP != strip:  # the direction hardly turns within a strip
+                strip = j // STRIP
+                du, dv = _spread(field, i, strip * STRIP, H, W, 0), _spread(field, i, strip * STRIP, H, W, 1)
+                n = math.hypot(du, dv)
+                x = round(reach * du / n) if n > 0.0 else 0
+                y = round(reach * dv / n) if n > 0.0 else 0
+            if x == 0 and y == 0:
                 continue
-            x = round(reach * du / n)
-            y = round(reach * dv / n)
             a, b = phase[i, j], phase[i, j]
             va = vb = sigma[i, j] ** 2
             if 0 <= i + y < H and 0 <= j + x < W and reasons[i + y, j + x] == 0:
@@ -54,7 +59,7 @@ def gradient_signs(first, last, phase, sigma, reasons, field, reach, significanc
             if 0 <= i - y < H and 0 <= j - x < W and reasons[i - y, j - x] == 0:
                 b = phase[i - y, j - x]
                 vb = sigma[i - y, j - x] ** 2
-            if abs(a - b) > significance * math.sqrt(va + vb):
+            if (a - b) * (a - b) > significance * significance * (va + vb):
                 out[i, j] = 1 if a > b else -1
 
 
@@ -62,10 +67,20 @@ def gradient_signs(first, last, phase, sigma, reasons, field, reach, significanc
 def majority_backward(first, last, signs, radius, share, least, out):
     """Where at least `share` of at least `least` signs in the window are backward: a contiguous reversal."""
     H, W = signs.shape
+    column = np.empty(W, np.int64)
     for i in range(first, last):
+        column[:] = 0
+        for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+            for j in range(W):
+                column[j] += signs[y, j] < 0
         for j in range(W):
             out[i, j] = False
             back = votes = 0
+            for x in range(max(j - radius, 0), min(j + radius + 1, W)):
+                back += column[x]
+            if back == 0:
+                continue
+            back = 0
             for y in range(max(i - radius, 0), min(i + radius + 1, H)):
                 for x in range(max(j - radius, 0), min(j + radius + 1, W)):
                     if signs[y, x] != 0:
@@ -77,14 +92,21 @@ def majority_backward(first, last, signs, radius, share, least, out):
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+def largest_step(field, factor, floor, i, j, H, W):
+    """T1 without noise: `factor` times the growth that a surface facing both devices has at this pixel, per pixel.
+
+    The growth is channel 2 of `field`, radians per pixel; T1 is at least `floor`.
+    """
+    return max(factor * _spread(field, i, j, H, W, 2), floor)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def linked(phase, sigma, step, noise, i, j, y, x):
     """Whether two pixels in one row or column or diagonal continue one surface: their phases differ by less than T1.
 
-    T1 = `factor` times the growth that a surface facing both devices has at this pixel (channel 2 of `field`, radians
-    per pixel), at least `floor`, times the distance, plus `noise` standard deviations.
+    T1 = `step` (see `largest_step`) times the distance, plus `noise` standard deviations.
     """
-    limit = max(factor * _spread(field, i, j, H, W, 2), floor) * max(abs(i - y), abs(j - x))
-    limit += noise * math.sqrt(sigma[i, j] ** 2 + sigma[y, x] ** 2)
+    limit = step * max(abs(i - y), abs(j - x)) + noise * math.sqrt(sigma[i, j] ** 2 + sigma[y, x] ** 2)
     return abs(phase[i, j] - phase[y, x]) < limit
 
 
@@ -101,6 +123,7 @@ def loose_pixels(first, last, phase, sigma, reasons, field, factor, floor, noise
             out[i, j] = False
             if reasons[i, j] != 0:
                 continue
+            step = largest_step(field, factor, floor, i, j, H, W)
             loose = True
             for distance in range(1, 3):
                 links = 0
@@ -114,7 +137,7 @@ def loose_pixels(first, last, phase, sigma, reasons, field, factor, floor, noise
                         inside += 1
                         if reasons[y, x] != 0:
                             continue
-                        if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+                        if linked(phase, sigma, step, noise, i, j, y, x):
                             links += 1
                 loose = loose and 8 * links < least * inside
             out[i, j] = loose
@@ -141,6 +164,7 @@ def domains(phase, sigma, reasons, field, factor, floor, noise, label):
         for j in range(W):
             if reasons[i, j] != 0:
                 continue
+            step = largest_step(field, factor, floor, i, j, H, W)
             for back in range(2):
                 y = i - back
                 x = j - 1 + back
@@ -149,7 +173,7 @@ def domains(phase, sigma, reasons, field, factor, floor, noise, label):
                     x -= 1 - back
                 if y < 0 or x < 0 or reasons[y, x] != 0:
                     continue
-                if linked(phase, sigma, field, factor, floor, noise, i, j, y, x, H, W):
+                if linked(phase, sigma, step, noise, i, j, y, x):
                     a, b = _root(parent, i * W + j), _root(parent, y * W + x)
                     parent[max(a, b)] = min(a, b)
     count = 0

@@ -146,3 +146,47 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
                     phase[i + y, left:right], phase[i + below, left:right], reasons[i + y, left:right], wide, most, mask
                 )
             _verdict(off, most, mask, step, n, ask[i, col : col + n])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _widen(row, m, low, high):
+    """Take a row's values into the least and greatest per column; NaN takes no part."""
+    for j in range(m):
+        low[j] = row[j] if row[j] < low[j] else low[j]
+        high[j] = row[j] if row[j] > high[j] else high[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _shifted(low, high, other_low, other_high, n):
+    for j in range(n):
+        low[j] = other_low[j] if other_low[j] < low[j] else low[j]
+        high[j] = other_high[j] if other_high[j] > high[j] else high[j]
+
+
+@by_rows(lambda phase, *_: phase.shape[0])
+def torn_orders(first, last, phase, radius, range_, ask):
+    """Pixels whose order the neighbours' vote may change: True in `ask` (H, W).
+
+    Where the phases in the window of `radius` differ by less than `range_` (pi), every voter is for the own order.
+    """
+    H, W = phase.shape
+    m = BLOCK + 2 * radius
+    low, high = np.empty(m, np.float32), np.empty(m, np.float32)
+    least, most = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    far, big = _f(range_), _f(np.inf)
+    for i in range(first, last):
+        for col in range(0, W, BLOCK):
+            n = min(BLOCK, W - col)
+            left, right = max(col - radius, 0), min(col + n + radius, W)
+            skip = left - (col - radius)  # columns of the scratch that lie outside the picture
+            low[:] = big
+            high[:] = -big
+            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+                _widen(phase[y, left:right], right - left, low[skip:], high[skip:])
+            least[:n] = big
+            most[:n] = -big
+            for x in range(2 * radius + 1):
+                _shifted(least, most, low[x : x + n], high[x : x + n], n)
+            target = ask[i, col : col + n]
+            for j in range(n):
+                target[j] = most[j] - least[j] >= far

@@ -13,6 +13,7 @@ import numpy as np
 from fringescope import geometry
 from fringescope.errors import DecodeError
 from fringescope.kernels import fringes as k
+from fringescope.kernels import screens
 from fringescope.settings import PhaseSettings
 from fringescope.types import (
     F32,
@@ -31,6 +32,7 @@ from fringescope.types import (
 
 MOST_REPEATS = 2.5  #: of what the sets tell apart, that a ray may cross in the measuring space
 CONFIRMATIONS = 3  #: rounds in which pixels that are certain confirm uncertain neighbours
+ORDER = 0.99 * math.pi  #: phases of neighbours that differ by less are of one order, whatever their slope
 LEAST_SYSTEMATIC = 0.005  #: rad; less is not believed of any fringes
 MOST_MISS = 2.5  #: systematic errors, amplified by the ratio of the periods, by which a set may miss all over
 PARALLEL_RAD = 1e-4  #: sets whose gradients differ less than this in angle (either sign) unwrap each other
@@ -268,7 +270,8 @@ def _elect(absolute: F32, trusted: Bool, uncertain: Bool, s: PhaseSettings) -> t
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     least = max(3, window.size // 4)
     changed = np.zeros(absolute.shape, np.int8)
-    asked = np.ones(absolute.shape, bool)
+    asked = np.empty(absolute.shape, bool)
+    screens.torn_orders(voters, radius, ORDER, asked)  # where neighbours are of one mind there is nothing to ask
     for _ in range(3):
         out = np.empty_like(absolute)
         k.order_votes(absolute, voters, asked, radius, least, s.order_majority, slope, out, changed)
