@@ -5,6 +5,7 @@ A rig that has drifted, or was never right, shows here: the same tissue appears 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -75,7 +76,7 @@ def agreement(grids: Sequence[Grid], rig: Rig, window: int = WINDOW) -> Agreemen
     n = np.array([p.points for p in pairs], dtype=float)
     systematic_um = float(np.sqrt(np.average([p.systematic_um**2 for p in pairs], weights=n)))
     median_um = 1e3 * float(np.median(np.abs(np.concatenate(every))))
-    return Agreement(median_um, median_um / np.sqrt(2), systematic_um, tuple(pairs))
+    return Agreement(median_um, median_um / math.sqrt(2.0), systematic_um, tuple(pairs))
 
 
 def systematic_part(rows: NDArray[np.intp], columns: NDArray[np.intp], error: F64, shape: tuple[int, ...]) -> float:
