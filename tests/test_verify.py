@@ -152,6 +152,9 @@ def test_the_verdict_says_why(rig: Rig) -> None:
     assert nothing.verdict == "unknown"
     assert "nothing to compare" in nothing.words[-1]
     assert verdict(rig, None, sphere_radius_error_um=-300.0).verdict == "drifted"
+    assert "measured too small by 300 um" in verdict(rig, None, sphere_radius_error_um=-300.0).words[0]
+    shrunk = evaluate.BoardTrueness(88, 1.0, 0.5, -2999.6, 3.0, None)
+    assert "the board is measured too small by 3000 ppm (limit 509)" in verdict(rig, 1.0, board=shrunk).words[0]
     assert verdict(rig, 1.0, blind=("camera2",)).verdict == "unknown"
     held = {"calibration": {"held_out": [{"corner_mm_rms": 0.6}, {"corner_mm_rms": None}, "x"]}}
     modest = replace(rig, extra=held)  # never was better than 600 um

@@ -60,7 +60,7 @@ def judge(
     good: list[str] = []
 
     def weigh(value: float, most: float, what: str, unit: str, cure: str) -> None:
-        text = f"{what} {value:.3g} {unit} (limit {most:.3g})"
+        text = f"{what} {_figure(value)} {unit} (limit {_figure(most)})"
         (bad if abs(value) > most else good).append(text + (f": {cure}" if abs(value) > most else ""))
 
     anew = "a device has moved or the rig is of another set-up; calibrate anew"
@@ -70,11 +70,13 @@ def judge(
         weigh(e.systematic_um, limit, f"light that {e.camera} sees misses its place by", "um", anew)
     if board is not None:
         most = s.limit_scale_ppm + 3 * board.scale_sigma_ppm
-        weigh(board.scale_error_ppm, most, "the board is measured too large by", "ppm",
+        size = "small" if board.scale_error_ppm < 0 else "large"
+        weigh(abs(board.scale_error_ppm), most, f"the board is measured too {size} by", "ppm",
               "check the square size in board.json and the print's scale; else calibrate anew")  # fmt: skip
         weigh(board.rms_um, 2 * limit, "corners miss the board's grid by", "um rms", anew)
     if sphere_radius_error_um is not None:
-        weigh(sphere_radius_error_um, limit, "the sphere's radius is off by", "um", anew)
+        size = "small" if sphere_radius_error_um < 0 else "large"
+        weigh(abs(sphere_radius_error_um), limit, f"the sphere's radius is measured too {size} by", "um", anew)
     if not bad and not good:
         doubts = (*doubts, "nothing to compare: one view, no board, no sphere; capture the board, or use two cameras")
     if blind:
@@ -94,6 +96,11 @@ def judge(
         views,
         epipolar,
     )
+
+
+def _figure(x: float) -> str:
+    """Three digits, without an exponent."""
+    return f"{x:.3g}" if abs(x) < 999.5 else f"{x:.0f}"
 
 
 def promised_um(rig: Rig) -> float:
