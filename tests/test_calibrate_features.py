@@ -266,7 +266,8 @@ def test_equalise_moves_nothing(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize(
     ("squares", "message"),
     [
-        ((8, 7), "the picture shows 9 x 6 inner corners, board.json says 7 x 6"),
+        ((8, 7), "the picture shows 9 x 6 inner corners, board.json says 7 x 6; count them and "
+         "correct board.json, or show more of the board if a part of it is hidden"),
         ((13, 7), "the picture shows 9 x 6 inner corners, board.json says 12 x 6"),
         ((10, 6), "the picture shows 9 x 6 inner corners, board.json says 9 x 5"),
     ],

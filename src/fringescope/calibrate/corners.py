@@ -162,7 +162,7 @@ def _unusable(why: AnyArray, name: str) -> str:
         return f"{name}: the board is saturated ({counts['saturated']} of {len(why)} corners); expose it less"
     listed = "".join(f"; {n} {w}" for w, n in counts.most_common(3))
     good = len(why) - sum(counts.values())
-    return f"{name}: no board found: {good} of {len(why)} likely corners are some{listed}; show it in focus, evenly lit"
+    return f"{name}: no board found: {good} of {len(why)} likely corners are real{listed}; show it in focus, evenly lit"
 
 
 def _trim(index: I32, board: Board) -> I32:
