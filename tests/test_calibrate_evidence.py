@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fringescope import geometry
 from fringescope.calibrate import coverage, prediction, scatter
-from fringescope.calibrate.evidence import correlations, evidence
+from fringescope.calibrate.evidence import correlations, evidence, told
 from fringescope.settings import EvidenceSettings
 from fringescope.types import Camera, HeldOut, LeftOut, Lens, Pose, Projector, Rig
 from tests.calibration_scenes import board_poses, calibration, cv_project
@@ -216,6 +216,7 @@ def test_a_good_calibration_is_called_good():
     assert json.dumps(dataclasses.asdict(e), allow_nan=True)
     row = next(p for p in e.poses if p.pose == "pose01")
     assert row.notes == ("camera1: 3 points left out: they miss by 0.4 px, the others by 0.01",)
+    assert told("camera1", 1, "far off") == "camera1: 1 point left out: far off"
     assert row.corner_px["camera2"] == pytest.approx(0.014, rel=0.3)
     assert np.degrees(row.tilt_rad) == pytest.approx(22, abs=3)
 

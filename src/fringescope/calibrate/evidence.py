@@ -131,7 +131,8 @@ def pose_figures(calibration: Calibration, held_out: Sequence[HeldOut]) -> tuple
 def told(camera: str | None, points: int | None, why: str) -> str:
     """What was left out, in words."""
     where = f"{camera}: " if camera else ""
-    what = f"{points} points" if points is not None else ("the whole sighting" if camera else "the whole pose")
+    whole = "the whole sighting" if camera else "the whole pose"
+    what = whole if points is None else f"{points} point{'s' if points != 1 else ''}"
     return f"{where}{what} left out: {why}"
 
 

@@ -24,6 +24,7 @@ from fringescope.calibrate.adjust import (
     residuals,
     robust_noise,
     settle,
+    shape_terms,
     thinned,
 )
 from fringescope.calibrate.problem import (
@@ -57,7 +58,7 @@ def solve(sightings: Sequence[Sighting], board: Board, sizes: Sizes, s: Calibrat
     poses, UsageError for settings that cannot mean anything.
     """
     s = s or CalibrateSettings()
-    asked_models(0, s)
+    check(s)
     used, left = _able(sightings, sizes)
     problem = make_problem(used, board, sizes, s)
     _enough(problem, s, left)
@@ -117,10 +118,17 @@ def _crooked(n: Sighting) -> str | None:
     return f"corners {miss:.2g} px off a flat grid: numbered wrongly" if miss > 0.15 * span else None
 
 
-def make_problem(used: Sequence[Sighting], board: Board, sizes: Sizes, s: CalibrateSettings) -> Problem:
-    """The measurements of sightings as blocks; each block's `sighting` counts `used`."""
+def check(s: CalibrateSettings) -> None:
+    """Raises UsageError for settings that cannot mean anything, whatever the pictures show."""
+    asked_models(2, s)
+    shape_terms(s)
     if s.projector not in ("samples", "centres", "corners"):
         raise UsageError(f"setting projector: '{s.projector}'; needed samples, centres or corners")
+
+
+def make_problem(used: Sequence[Sighting], board: Board, sizes: Sizes, s: CalibrateSettings) -> Problem:
+    """The measurements of sightings as blocks; each block's `sighting` counts `used`."""
+    check(s)
     poses = tuple(sorted({n.pose for n in used}))
     names = list(sizes.cameras)
     blocks: list[Block] = []

@@ -59,7 +59,7 @@ def pictures(
     data = _encoded(overlays)
     left: dict[str, list[str]] = {}
     for o in c.left_out if c is not None else ():
-        why = f"{'the sighting' if o.points is None else f'{o.points} points'} left out: {o.why}"
+        why = f"{'the sighting' if o.points is None else f'{o.points} point' + 's' * (o.points != 1)} left out: {o.why}"
         for n in names:
             if n.split("/")[0] == o.pose and (o.camera is None or n == f"{o.pose}/{o.camera}"):
                 left.setdefault(n, []).append(why)
@@ -156,7 +156,7 @@ def failed(
 def _advice(sightings: Sequence[Sighting], poses: Sequence[str], cameras: Sequence[str]) -> list[str]:
     """Plain next steps, from what was found in which picture."""
     out = []
-    if not sightings:
+    if poses and not sightings:
         out.append(
             "no board was found in any picture: check that board.json describes the board (inner corners are one fewer "
             "than squares each way), and that it is lit, in focus and larger than a third of the picture"
