@@ -12,7 +12,7 @@ from fringescope import geometry
 from fringescope.calibrate import coverage, prediction, scatter
 from fringescope.calibrate.evidence import correlations, evidence, told
 from fringescope.settings import EvidenceSettings
-from fringescope.types import Camera, HeldOut, LeftOut, Lens, Pose, Projector, Rig
+from fringescope.types import Camera, HeldOut, Layout, LeftOut, Lens, Pose, Projector, Rig
 from tests.calibration_scenes import board_poses, calibration, cv_project
 
 S = EvidenceSettings(permutations=500)
@@ -233,6 +233,20 @@ def test_what_to_photograph_next_is_said():
     assert "right" in told
     assert "near one line" in " ".join(e.weak)
     assert e.verdict != "good"
+
+
+def test_a_layout_that_the_focal_lengths_contradict_is_said():
+    c = calibration("paper", n=12, sigma=0.01)
+    p = c.rig.projector
+    assert p.layout is Layout.DIAMOND
+    assert "layout" not in " ".join(evidence(c, held(c), S).weak)
+    K = p.lens.K * [[1], [2], [1]]
+    rig = Rig(dataclasses.replace(p, lens=dataclasses.replace(p.lens, K=K)), c.rig.cameras, c.rig.volume)
+    e = evidence(dataclasses.replace(c, rig=rig), held(c), S)
+    assert any("fy is 2.00 fx" in w and "layout grid" in w for w in e.weak)
+    assert e.verdict != "good"
+    grid = dataclasses.replace(rig.projector, layout=Layout.GRID)  # a grid's units may be what they are
+    assert "layout" not in " ".join(evidence(dataclasses.replace(c, rig=Rig(grid, c.rig.cameras)), held(c), S).weak)
 
 
 def test_tilt_is_told_on_the_right_side():

@@ -203,6 +203,7 @@ class EvidenceSettings(_Section):
     max_held_out: float = knob(2.0, "", "poses left out of the solve may fit this many times worse than those in it", "V-A", 1)
     max_held_out_px: float = knob(1.0, "pixels", "corners of poses left out, triangulated, in footprints of a pixel: more is weak, three times as much is no calibration", "V-A", 0)
     max_scale_ppm: float = knob(1500.0, "ppm", "the size of boards left out may be off by this", "V-A", 0)
+    max_anisotropy: float = knob(0.1, "", "focal lengths of a projector of diamond layout, whose units are square, that differ by more than this share speak of another layout", "", 0)
     tight_correlation: float = knob(0.95, "", "parameters correlated more than this are listed", "", 0, 1)
     permutations: int = knob(4000, "", "turned signs that a probability is made of, where there are too many to try all", "", 100, 1_000_000)
 

@@ -17,6 +17,7 @@ from fringescope.types import (
     Evidence,
     FieldTest,
     HeldOut,
+    Layout,
     PoseFigures,
     Prediction,
 )
@@ -63,6 +64,7 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
     _judge_prediction(w, predicted, footprint, s)
     _judge_poses(w, calibration, s)
     coverage.judge(w, calibration, covered, s)
+    _judge_layout(w, calibration, s)
     for word in _said(calibration):
         w.against(word, 0)
     pairs = correlations(calibration, s.tight_correlation)
@@ -267,6 +269,15 @@ def _judge_prediction(
     elif finite:
         w.good.append(f"The calibration alone makes points uncertain by {_um(max(v[0] for v in finite))} (median), "
                       f"at most {_um(max(v[2] for v in finite))}.")  # fmt: skip
+
+
+def _judge_layout(w: _Words, calibration: Calibration, s: EvidenceSettings) -> None:
+    """The units of a diamond device's plane are square: focal lengths that differ tell another layout."""
+    p = calibration.rig.projector
+    ratio = float(p.lens.K[1, 1] / p.lens.K[0, 0])
+    if p.layout is Layout.DIAMOND and abs(ratio - 1) > s.max_anisotropy:
+        w.against(f"projector: fy is {ratio:.2f} fx, but the units of a diamond layout are square: is its layout grid?")
+        w.next.append("check the projector's layout in capture.json: with a wrong one guidelines come out elsewhere")
 
 
 def _judge_poses(w: _Words, calibration: Calibration, s: EvidenceSettings) -> None:
