@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -313,6 +314,18 @@ def test_markers_tell_the_numbering(changes: dict[str, Any]) -> None:
     assert len(s.corner) >= 34
     assert rms(corner_error(p, s)) < 0.004
     assert rms(sample_error(p, s) * 2 * np.pi / 36 / s.sample_sigma) == pytest.approx(1, abs=0.2)
+
+
+def test_squares_too_small_for_a_rim_of_a_marker_say_so() -> None:
+    half = CHARUCO.but(size=(220, 170), focal=1050, blur=0.4)
+    _, s = look(half, board=board(half, 4.4, "DICT_4X4_100"))
+    assert len(s.sample_px) == 0
+    found = re.search(r"too small in the picture \((\d+) pixels wide; needed about (\d+)", " ".join(s.words))
+    assert found is not None
+    wide, needed = map(int, found.groups())
+    assert wide == pytest.approx(np.median(np.linalg.norm(np.diff(s.corner_px[:8], axis=0), axis=1)), rel=0.15)
+    enough = half.but(size=(640, 480), focal=1050 * 1.1 * needed / wide)
+    assert len(look(enough, board=board(enough, 4.4, "DICT_4X4_100"))[1].sample_px) > 500
 
 
 def test_markers_before_opencv_4_6() -> None:
