@@ -263,3 +263,21 @@ def test_help_says_that_the_rig_is_a_file(capsys) -> None:
     shown = capsys.readouterr().out
     assert "rig.json to write" in shown
     assert "empty folder" not in shown
+
+
+def test_a_missing_frame_costs_its_picture_and_a_pose_without_a_capture_is_named(session, tmp_path, capsys) -> None:
+    folder, rig = session(0, 1, 2, 3, 4, cameras=2), tmp_path / "rig.json"
+    (folder / "pose01" / "camera2" / "05.png").unlink()
+    (folder / "pose04" / "capture.json").unlink()
+    (folder / "truth").mkdir()  # no pose
+    assert cli.run(["calibrate", str(folder), "--out", str(rig), "--json", *THIN]) == 0
+    told = sorted(json.loads(capsys.readouterr().out)["not_used"])
+    assert len(told) == 2
+    assert told[0].startswith("pose01/camera2: ")
+    assert "05.png: frame is missing" in told[0]
+    assert told[1].startswith("pose04: no capture.json in it")
+    names = {s.name for s in store.read_observations(rig)[1]}
+    assert names == {f"pose{p:02d}/camera{c}" for p in range(4) for c in (1, 2)} - {"pose01/camera2"}
+    page = (tmp_path / "rig.html").read_text()
+    assert "05.png: frame is missing" in page
+    assert "no capture.json in it" in page

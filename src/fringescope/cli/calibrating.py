@@ -55,7 +55,7 @@ def look(session: Session, s: Settings, progress: Progress, response: Response |
     """
     from fringescope import pipeline, store
 
-    out = Looked()
+    out = Looked(wrong=dict(session.left_out))
     inputs = [(pose, v) for pose, capture in session.poses for v in store.view_inputs(capture, response)]
     for pose, view in progress.track(inputs, "looking at the boards", len(inputs)):
         name = f"{pose}/{view.plan.camera}"
@@ -116,11 +116,13 @@ def rig_with_evidence(c: Calibration, evidence: Evidence, s: Settings) -> Rig:
     from fringescope.settings import to_dict
 
     doc = store.calibration_document(c)
+    predicted = evidence.prediction
     doc["calibration"] |= {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"fringescope": __version__},
         "settings": {k: v for k, v in to_dict(s).items() if k in ("board", "calibrate")},
         "verdict": evidence.verdict,
+        "predicted_views_um": {k: m for k, (m, _) in predicted.views_um.items()} if predicted is not None else {},
         "held_out": [asdict(p.held_out) for p in evidence.poses if p.held_out is not None],
     }
     return replace(c.rig, extra={**c.rig.extra, **doc})
@@ -193,7 +195,8 @@ def _reasons(looked: Looked, said: str) -> list[str]:
     """Of each camera that the failure `said` names, the most frequent reason why its pictures show no board."""
     of: dict[str, list[str]] = {}
     for name, why in looked.wrong.items():
-        of.setdefault(name.split("/", 1)[1], []).append(why)
+        if "/" in name:
+            of.setdefault(name.split("/", 1)[1], []).append(why)
     out = []
     for camera, every in of.items():
         kinds = Counter(re.sub(r"[\d.]+", "0", why) for why in every)  # the same reason with other figures
