@@ -85,6 +85,9 @@ def test_pictures_that_cannot_be_read_are_left_out_by_name(session, tmp_path, ca
         np.testing.assert_allclose(two.lens.K, one.lens.K, rtol=1e-5)
         np.testing.assert_allclose(two.pose.t, one.pose.t, atol=2e-3)
     assert a.volume is not None
+    promised = a.extra["calibration"]["predicted_views_um"]
+    assert set(promised) == {"camera1 - camera2"}
+    assert 0.05 < promised["camera1 - camera2"] < 5
     board, sightings = store.read_observations(rig)
     assert board.inner_corners == (11, 8)
     assert {s.name for s in sightings} == {f"pose{p:02d}/camera{c}" for p in range(4) for c in (1, 2)} - {

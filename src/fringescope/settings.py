@@ -231,6 +231,8 @@ class VerifySettings(_Section):
     """Is a rig still true? (III-E)"""
 
     limit: float = knob(4e-5, "working distances", "views, corners or a sphere that differ systematically by more than this say that the rig has drifted: 20 um at 500 mm", "III-E", 1e-7, 0.1)
+    warn: float = knob(1e-5, "working distances", "views that differ systematically by less than this are as noise and surfaces leave them: 5 um at 500 mm; by more, and by more than the calibration promised, they are worth a warning", "III-E", 1e-7, 0.1)
+    warn_promised: float = knob(5.0, "", "the same, in errors between the views that the calibration predicted", "III-E", 1)
     limit_scale_ppm: float = knob(500.0, "ppm", "a board measured too large or too small by more than this, and three standard errors, says the same", "III-E", 0)
 
 
