@@ -54,6 +54,7 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
     """
     fields = tuple(scatter.field_test(v, s) for v in scatter.by_device(calibration))
     covered = coverage.coverage(calibration)
+    inside = coverage.filled(calibration)
     predicted = prediction.predict(calibration)
     poses = pose_figures(calibration, held_out)
     footprint = {c.name: pixel_mm(calibration, c) for c in calibration.rig.cameras}
@@ -78,7 +79,8 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
         poses,
         pairs,
         predicted,
-        figures,
+        figures | {"volume reached": inside.share},
+        inside,
     )
 
 
@@ -119,7 +121,7 @@ def pose_figures(calibration: Calibration, held_out: Sequence[HeldOut]) -> tuple
         out.append(PoseFigures(
             pose,
             {s.camera: rms(np.hypot(*r.corner.T)) for s, r in mine if len(r.corner)},
-            {s.camera: rms(r.sample) for s, r in mine if r.sample.size},
+            {s.camera: rms(np.hypot(*scatter.along(s.directions, r.sample).T)) for s, r in mine if r.sample.size},
             sum(int(np.isfinite(r.corner).all(axis=1).sum()) for _, r in mine),
             sum(int(np.isfinite(r.sample).any(axis=1).sum()) for _, r in mine if r.sample.size),
             left.get(pose),

@@ -157,7 +157,7 @@ def failed(
 def _advice(sightings: Sequence[Sighting], poses: Sequence[str], cameras: Sequence[str]) -> list[str]:
     """Plain next steps, from what was found in which picture."""
     out = []
-    if poses and not sightings:
+    if not sightings:
         out.append(
             "no board was found in any picture: check that board.json describes the board (inner corners are one fewer "
             "than squares each way), and that it is lit, in focus and larger than a third of the picture"
