@@ -56,7 +56,8 @@ def look(session: Session, s: Settings, progress: Progress, response: Response |
     from fringescope import pipeline, store
 
     out = Looked(wrong=dict(session.left_out))
-    inputs = [(pose, v) for pose, capture in session.poses for v in store.view_inputs(capture, response)]
+    plain = [(p, replace(c, views=tuple(replace(v, color=None) for v in c.views))) for p, c in session.poses]
+    inputs = [(pose, v) for pose, capture in plain for v in store.view_inputs(capture, response)]
     for pose, view in progress.track(inputs, "looking at the boards", len(inputs)):
         name = f"{pose}/{view.plan.camera}"
         try:
