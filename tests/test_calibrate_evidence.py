@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from fringescope import geometry
 from fringescope.calibrate import coverage, prediction, scatter
-from fringescope.calibrate.evidence import correlations, evidence
+from fringescope.calibrate.evidence import correlations, evidence, told
 from fringescope.settings import EvidenceSettings
-from fringescope.types import Camera, HeldOut, LeftOut, Lens, Pose, Projector, Rig
+from fringescope.types import Camera, HeldOut, Layout, LeftOut, Lens, Pose, Projector, Rig
 from tests.calibration_scenes import board_poses, calibration, cv_project
 
 S = EvidenceSettings(permutations=500)
@@ -216,7 +216,10 @@ def test_a_good_calibration_is_called_good():
     assert json.dumps(dataclasses.asdict(e), allow_nan=True)
     row = next(p for p in e.poses if p.pose == "pose01")
     assert row.notes == ("camera1: 3 points left out: they miss by 0.4 px, the others by 0.01",)
+    assert told("camera1", 1, "far off") == "camera1: 1 point left out: far off"
     assert row.corner_px["camera2"] == pytest.approx(0.014, rel=0.3)
+    head = next(f.rms for f in e.fields if f.kind == "phase")
+    assert row.sample_units["camera2"] == pytest.approx(head, rel=0.1)  # one measure in the head and in the table
     assert np.degrees(row.tilt_rad) == pytest.approx(22, abs=3)
 
 
@@ -232,6 +235,20 @@ def test_what_to_photograph_next_is_said():
     assert "right" in told
     assert "near one line" in " ".join(e.weak)
     assert e.verdict != "good"
+
+
+def test_a_layout_that_the_focal_lengths_contradict_is_said():
+    c = calibration("paper", n=12, sigma=0.01)
+    p = c.rig.projector
+    assert p.layout is Layout.DIAMOND
+    assert "layout" not in " ".join(evidence(c, held(c), S).weak)
+    K = p.lens.K * [[1], [2], [1]]
+    rig = Rig(dataclasses.replace(p, lens=dataclasses.replace(p.lens, K=K)), c.rig.cameras, c.rig.volume)
+    e = evidence(dataclasses.replace(c, rig=rig), held(c), S)
+    assert any("fy is 2.00 fx" in w and "layout grid" in w for w in e.weak)
+    assert e.verdict != "good"
+    grid = dataclasses.replace(rig.projector, layout=Layout.GRID)  # a grid's units may be what they are
+    assert "layout" not in " ".join(evidence(dataclasses.replace(c, rig=Rig(grid, c.rig.cameras)), held(c), S).weak)
 
 
 def test_tilt_is_told_on_the_right_side():
@@ -253,6 +270,28 @@ def test_tilt_is_told_on_the_right_side():
     told = " ".join(evidence(c, held(c), S).next)
     assert "away from camera1" in told
     assert "tilted towards camera1" not in told
+
+
+def test_the_volume_is_filled_where_boards_were():
+    flat = Rotation.from_euler("x", np.pi).as_matrix()
+    poses = {f"pose{i:02}": Pose(flat, [x - 25.0, 17.5, z]) for i, (x, z) in enumerate([(0, 0), (0, 1), (8, 0)])}
+    c = calibration("paper", poses=poses)  # the volume: 60 x 44 x 28 mm about the origin; the board's corners: 50 x 35
+    f = coverage.filled(c)
+    below, middle, above = (np.array(layer) for layer in f.layers)
+    assert middle.shape == (6, 8)
+    assert f.edges_mm == pytest.approx([-14, -14 / 3, 14 / 3, 14])
+    assert (below <= 0).all()
+    assert (above <= 0).all()
+    assert (middle[1:-1, 1:-1] == 3).all()
+    assert (middle[2, 0], middle[2, -1]) == (2, 3)  # the third pose stands to the right: columns grow with x
+    every = np.concatenate([below.ravel(), middle.ravel(), above.ravel()])
+    assert f.share == pytest.approx((every > 0).sum() / (every >= 0).sum())
+    lifted = {k: Pose(flat, np.add(T.t, [0, 6, 9])) for k, T in poses.items()}
+    layers = [np.array(layer) for layer in coverage.filled(calibration("paper", poses=lifted)).layers]
+    assert (layers[1] <= 0).all()
+    assert layers[2][-1].max() > 0  # rows grow with y, layers with z
+    assert layers[2][0].max() <= 0
+    assert evidence(c, held(c), S).figures["volume reached"] == f.share
 
 
 def test_cells_count_corners_where_they_are():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -266,7 +267,8 @@ def test_equalise_moves_nothing(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize(
     ("squares", "message"),
     [
-        ((8, 7), "the picture shows 9 x 6 inner corners, board.json says 7 x 6"),
+        ((8, 7), "the picture shows 9 x 6 inner corners, board.json says 7 x 6; count them and "
+         "correct board.json, or show more of the board if a part of it is hidden"),
         ((13, 7), "the picture shows 9 x 6 inner corners, board.json says 12 x 6"),
         ((10, 6), "the picture shows 9 x 6 inner corners, board.json says 9 x 5"),
     ],
@@ -312,6 +314,18 @@ def test_markers_tell_the_numbering(changes: dict[str, Any]) -> None:
     assert len(s.corner) >= 34
     assert rms(corner_error(p, s)) < 0.004
     assert rms(sample_error(p, s) * 2 * np.pi / 36 / s.sample_sigma) == pytest.approx(1, abs=0.2)
+
+
+def test_squares_too_small_for_a_rim_of_a_marker_say_so() -> None:
+    half = CHARUCO.but(size=(220, 170), focal=1050, blur=0.4)
+    _, s = look(half, board=board(half, 4.4, "DICT_4X4_100"))
+    assert len(s.sample_px) == 0
+    found = re.search(r"too small in the picture \((\d+) pixels wide; needed about (\d+)", " ".join(s.words))
+    assert found is not None
+    wide, needed = map(int, found.groups())
+    assert wide == pytest.approx(np.median(np.linalg.norm(np.diff(s.corner_px[:8], axis=0), axis=1)), rel=0.15)
+    enough = half.but(size=(640, 480), focal=1050 * 1.1 * needed / wide)
+    assert len(look(enough, board=board(enough, 4.4, "DICT_4X4_100"))[1].sample_px) > 500
 
 
 def test_markers_before_opencv_4_6() -> None:

@@ -409,6 +409,13 @@ def test_too_few_poses_and_wrong_input() -> None:
     blind = [replace(s, sample_phase=s.sample_phase * none, square_uv=s.square_uv * none) for s in seen]
     with pytest.raises(CalibrationError, match="project fringes along both"):
         calibrate.solve(blind, BOARD, w.sizes, USUAL)
+    first = {"sample_phase": (slice(None), [0]), "sample_sigma": (slice(None), [0]), "directions": [0]}
+    along = [replace(s, **{name: getattr(s, name)[cut] for name, cut in first.items()}) for s in seen]
+    with pytest.raises(CalibrationError, match=r"fringes along one direction only came .* along both u and v"):
+        calibrate.solve(along, BOARD, w.sizes, USUAL)
+    small = [replace(s, words=("9 white squares left out: too small in the picture (15 pixels wide)",)) for s in blind]
+    with pytest.raises(CalibrationError, match=r"pose00/camera1: 9 white squares .*15 pixels wide.*larger squares"):
+        calibrate.solve(small, BOARD, w.sizes, USUAL)
     bad = [("lens", "fisheye"), ("projector", "none"), ("board_shape", "round"), ("focal", "camera7=3"), ("focal", "a")]
     for name, value in [*bad, ("focal", "camera1=x"), ("principal_point", "camera1=3")]:
         with pytest.raises(UsageError):

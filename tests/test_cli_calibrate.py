@@ -85,6 +85,9 @@ def test_pictures_that_cannot_be_read_are_left_out_by_name(session, tmp_path, ca
         np.testing.assert_allclose(two.lens.K, one.lens.K, rtol=1e-5)
         np.testing.assert_allclose(two.pose.t, one.pose.t, atol=2e-3)
     assert a.volume is not None
+    promised = a.extra["calibration"]["predicted_views_um"]
+    assert set(promised) == {"camera1 - camera2"}
+    assert 0.05 < promised["camera1 - camera2"] < 5
     board, sightings = store.read_observations(rig)
     assert board.inner_corners == (11, 8)
     assert {s.name for s in sightings} == {f"pose{p:02d}/camera{c}" for p in range(4) for c in (1, 2)} - {
@@ -201,3 +204,85 @@ def test_pictures_of_20_megapixels_stay_below_3_gb(shared, tmp_path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert "1 usable pose" in done.stderr  # it found the board, and asks for more
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 3e6  # kB
+
+
+def test_what_is_wrong_is_named_once_and_a_mirrored_camera_with_its_reason(session, tmp_path, capsys) -> None:
+    folder, rig = session(0, 1, 2, 3, cameras=2), tmp_path / "rig.json"
+    for pose in folder.glob("pose*"):
+        path = pose / "capture.json"
+        doc = json.loads(path.read_text())
+        for v in doc["views"]:
+            v["pixel_format"] = "Mono8"
+            v.pop("color", None)
+        path.write_text(json.dumps(doc))
+        for p in pose.glob("camera*/*.png"):
+            grey = cv2.demosaicing(cv2.imread(str(p), cv2.IMREAD_UNCHANGED), cv2.COLOR_BayerBG2GRAY)
+            cv2.imwrite(str(p), cv2.flip(grey, 1) if p.parent.name == "camera2" else grey)
+    line = failed([folder, "--out", rig, *THIN], capsys)  # one line
+    assert "camera2 has 0 usable poses" in line
+    assert "camera2, 4 of 4 pictures: the projector's coordinates run mirrored in this picture" in line
+    assert "pose00/camera2" not in line
+    assert "camera1," not in line
+    page = (tmp_path / "rig.html").read_text()
+    assert "camera2, 4 of 4 pictures" in page
+    assert "camera2: pose0" not in page
+
+
+def test_settings_that_mean_nothing_are_refused_before_pictures_are_read(tmp_path, capsys) -> None:
+    (tmp_path / "session").mkdir()  # nothing in it: no picture is asked for
+    for wrong in ("lens=foo", "projector_lens=k9", "projector=stars", "board_shape=round"):
+        line = ["calibrate", str(tmp_path / "session"), "--out", str(tmp_path / "rig.json")]
+        assert cli.run([*line, "--set", f"calibrate.{wrong}"]) == 2
+        assert wrong.split("=")[1] in capsys.readouterr().err
+    assert not (tmp_path / "rig.html").exists()
+
+
+@pytest.mark.parametrize("spoil", ["no board", "no JSON", "another pattern", "no poses"])
+def test_a_session_that_cannot_be_read_gets_its_report(session, tmp_path, capsys, spoil) -> None:
+    folder = session(0, cameras=1)
+    if spoil == "no poses":
+        shutil.rmtree(folder / "pose00")
+    elif spoil == "no board":
+        (folder / "board.json").unlink()
+    else:
+        (folder / "board.json").write_text('{"pattern": "dots"}' if spoil == "another pattern" else '{"pattern": "ch')
+    page = tmp_path / "why.html"
+    line = failed([folder, "--out", tmp_path / "rig.json", "--report", page], capsys)
+    assert line.endswith(f"; see {page}")
+    text = page.read_text()
+    assert "No calibration" in text
+    assert {"no poses": "no captures"}.get(spoil, "board.json") in text
+    assert not (tmp_path / "rig.json").exists()
+
+
+def test_the_page_of_a_session_called_calibration_is_called_by_the_folder_above(session, tmp_path, capsys) -> None:
+    folder = session(0, cameras=1).rename(tmp_path / "calibration")
+    failed([folder, "--out", tmp_path / "rig.json", *THIN], capsys)
+    assert f"<h1>Calibration of {tmp_path.name}</h1>" in (tmp_path / "rig.html").read_text()
+
+
+def test_help_says_that_the_rig_is_a_file(capsys) -> None:
+    assert cli.run(["calibrate", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert "rig.json to write" in shown
+    assert "empty folder" not in shown
+
+
+def test_a_missing_frame_costs_its_picture_and_a_pose_without_a_capture_is_named(session, tmp_path, capsys) -> None:
+    folder, rig = session(0, 1, 2, 3, 4, cameras=2), tmp_path / "rig.json"
+    (folder / "pose01" / "camera2" / "05.png").unlink()
+    (folder / "pose04" / "capture.json").unlink()
+    colour = folder / "pose00" / "camera1" / "color.png"
+    colour.write_bytes(colour.read_bytes()[:3000])  # nothing here needs it
+    (folder / "truth").mkdir()  # no pose
+    assert cli.run(["calibrate", str(folder), "--out", str(rig), "--json", *THIN]) == 0
+    told = sorted(json.loads(capsys.readouterr().out)["not_used"])
+    assert len(told) == 2
+    assert told[0].startswith("pose01/camera2: ")
+    assert "05.png: frame is missing" in told[0]
+    assert told[1].startswith("pose04: no capture.json in it")
+    names = {s.name for s in store.read_observations(rig)[1]}
+    assert names == {f"pose{p:02d}/camera{c}" for p in range(4) for c in (1, 2)} - {"pose01/camera2"}
+    page = (tmp_path / "rig.html").read_text()
+    assert "05.png: frame is missing" in page
+    assert "no capture.json in it" in page

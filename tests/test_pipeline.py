@@ -190,7 +190,7 @@ def test_points_without_a_triangle_are_still_a_scan(rig, views):
 
 def test_blown_views_give_one_line_and_no_scan(rig, views):
     blown = [ViewInput(v.plan, [(k, np.full_like(f, 255)) for k, f in v.frames]) for v in views]
-    with pytest.raises(EmptyResultError, match=r"saturated: halve the exposure"):
+    with pytest.raises(EmptyResultError, match=r"saturated; halve the exposure"):
         pipeline.scan(blown, rig)
 
 

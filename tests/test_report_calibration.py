@@ -261,3 +261,20 @@ def test_a_browser_draws_it_without_a_word_of_complaint(solved, chromium, tmp_pa
     picture = cv2.imread(str(shot))
     green = (np.abs(picture.astype(int) - (91, 143, 47)).max(axis=-1) < 12).sum()
     assert green > 500  # the verdict, in its colour, on the first screen
+
+
+def test_no_table_is_cut_off_on_a_screen_1200_wide(solved, chromium, tmp_path):
+    c, e = solved
+    assert any(p.notes for p in e.poses)
+    page = report.calibration_page(c, e, c.sightings)
+    assert f"Boards reached <b>{100 * e.filled.share:.0f} %</b>" in page
+    page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
+    ask = "[...document.querySelectorAll('.scroll')].map(e => e.scrollWidth - e.clientWidth)"
+    path = tmp_path / "page.html"
+    path.write_text(page + f"<script>document.title = 'hidden: ' + Math.max(...{ask})</script>")
+    done = subprocess.run(
+        [chromium, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+         f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1200,900", "--dump-dom", path.as_uri()],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert "<title>hidden: 0</title>" in done.stdout

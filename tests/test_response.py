@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -429,6 +430,48 @@ def test_the_mugs_plane_tells_the_authors_exponent(shared: Path) -> None:
     assert disagreement(decoded(view, response.drawn_to_power(r, 1.645))) <= 0.6
 
 
+def test_the_documented_commands_free_the_mug(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    """docs/response.md, word by word: nothing but the folder with two drawings is looked at."""
+    page = (Path(__file__).parents[1] / "docs" / "response.md").read_text()
+    lines = [shlex.split(x)[1:] for x in page.splitlines() if x.startswith("    fringescope ")]
+    lines = [x for x in lines if x[1] in ("gamma_correction", "object2")]
+    assert [x[0] for x in lines] == ["response", "decode"]
+    for name in ("gamma_correction", "object2"):
+        (tmp_path / name).symlink_to(shared / "data" / "gamma-mug" / name)
+    monkeypatch.chdir(tmp_path)
+    assert run(lines[0]) == 0
+    told = capsys.readouterr().out
+    doc = json.loads((tmp_path / "response.json").read_text())
+    assert doc["drawn_to_power"] == pytest.approx(1.645, abs=0.12)  # the author's estimate
+    assert f"the second harmonic is {100 * doc['harmonics'][0]:.2f}" in told  # the words are of what the file holds
+    assert f"{doc['error_rad']['3']:.4f}" in told
+    assert f"drawn to the power {doc['drawn_to_power']:.4g}" in told
+    view = store.view_inputs(store.read_capture(shared / "data" / "gamma-mug" / "object2"))[0]
+    freed = pipeline.decode_view(replace(view, response=store.read_response(tmp_path / "response.json")), S)
+    assert disagreement(freed) <= 0.6
+    assert run(lines[1]) == 0
+    u = tifffile.imread(next((tmp_path / "decoded").glob("*/phase_0.tif")))
+    kept = np.isfinite(u)
+    assert kept.sum() > 1e6
+    np.testing.assert_array_equal(u[kept], freed.directions[0].phase[kept])
+
+
+def test_words_follow_the_power_that_fringes_are_drawn_to() -> None:
+    r = response.from_sets(decoded(draw(THREE, power(2.0))), SMALL)
+    assert r.needed
+    straight = response.as_drawn(r, 0.5, SMALL)  # 1 / gamma: linear
+    assert not straight.needed
+    assert "needs no correction" in straight.words[1]
+    strong = response.as_drawn(r, 1.5, SMALL)
+    assert strong.needed
+    assert strong.gamma == pytest.approx(3.0, rel=0.03)
+    np.testing.assert_allclose(strong.harmonics[:3], response.gamma_harmonics(3.0)[:3], atol=0.01)
+    assert f"{100 * strong.harmonics[0]:.2f}" in strong.words[0]
+    assert strong.sigmas[0] > 0
+    assert strong.error_sigma[3] > 0
+
+
 def test_the_skull_is_left_alone(shared: Path) -> None:
     view = store.view_inputs(store.read_capture(shared / "data" / "slstudio" / "skull"))[0]
     rig = store.read_rig(shared / "data" / "slstudio" / "rig-author.json")
@@ -515,6 +558,7 @@ def test_command_on_a_staircase(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (["--staircase", "9", "--exponents", "1,2"], 2, "one of them"),
         (["--levels", "9"], 2, "--levels"),
         (["--drawn", "0"], 2, "--drawn"),
+        (["--drawn", "found"], 2, "--drawn"),
     ],
 )
 def test_command_says_what_is_wrong(

@@ -153,12 +153,48 @@ def test_the_verdict_says_why(rig: Rig) -> None:
     assert nothing.verdict == "unknown"
     assert "nothing to compare" in nothing.words[-1]
     assert verdict(rig, None, sphere_radius_error_um=-300.0).verdict == "drifted"
+    assert "measured too small by 300 um" in verdict(rig, None, sphere_radius_error_um=-300.0).words[0]
+    shrunk = evaluate.BoardTrueness(88, 1.0, 0.5, -2999.6, 3.0, None)
+    assert "the board is measured too small by 3000 ppm (limit 509)" in verdict(rig, 1.0, board=shrunk).words[0]
     assert verdict(rig, 1.0, blind=("camera2",)).verdict == "unknown"
     held = {"calibration": {"held_out": [{"corner_mm_rms": 0.6}, {"corner_mm_rms": None}, "x"]}}
     modest = replace(rig, extra=held)  # never was better than 600 um
     assert evaluate.drift.promised_um(modest) == pytest.approx(600)
     assert verdict(modest, 500.0).verdict == "ok"
     json.dumps(nothing.to_dict(), allow_nan=False)
+
+
+def promising(rig: Rig, um: float) -> Rig:
+    """The rig, as if its calibration had predicted so much between two of its views, and half of it between others."""
+    views = {"camera1 - camera2": um, "camera1 - camera3": um / 2}
+    return replace(rig, extra={**rig.extra, "calibration": {"predicted_views_um": views}})
+
+
+def test_views_that_differ_by_far_more_than_was_promised_get_a_warning(rig: Rig) -> None:
+    assert not any("warning" in w for w in verdict(rig, 19.6).words)  # nothing was promised: the limit alone
+    told = verdict(promising(rig, 0.3), 19.6)
+    assert told.verdict == "ok"
+    assert told.words[0].startswith("warning: the views differ by 19.6 um, the calibration promised 0.3: something")
+    assert told.to_dict()["promised_views_um"] == pytest.approx(0.3)
+    assert not any("warning" in w for w in verdict(promising(rig, 0.3), 4.0).words)  # as surfaces may leave it
+    assert not any("warning" in w for w in verdict(promising(rig, 4.5), 19.6).words)  # it was never better
+    worse = verdict(promising(rig, 0.3), 500.0)
+    assert worse.verdict == "drifted"
+    assert not any("warning" in w for w in worse.words)
+
+
+@pytest.mark.parametrize(
+    ("name", "rad"), [("plane", 1e-5), ("sphere", 1e-5), ("tissue", 1e-5), ("calibration/pose00", 3e-5)]
+)
+def test_an_honest_capture_gets_no_warning_and_a_small_turn_does(shared, name, rad) -> None:
+    data = shared / "data" / "rendered-small"
+    views = store.view_inputs(store.read_capture(data / name))[:2]
+    rig = promising(store.read_rig(data / "truth" / "rig.json"), 0.3)
+    honest = pipeline.verify(views, rig, Settings())
+    assert honest.verdict == "ok"
+    assert not any("warning" in w for w in honest.words)
+    knocked = pipeline.verify(views, turned(rig, 1, rad), Settings())
+    assert any("something has moved" in w for w in knocked.words), knocked.words
 
 
 def test_rendered_captures(shared, tmp_path, capsys) -> None:

@@ -204,6 +204,7 @@ class EvidenceSettings(_Section):
     max_held_out: float = knob(2.0, "", "poses left out of the solve may fit this many times worse than those in it", "V-A", 1)
     max_held_out_px: float = knob(1.0, "pixels", "corners of poses left out, triangulated, in footprints of a pixel: more is weak, three times as much is no calibration", "V-A", 0)
     max_scale_ppm: float = knob(1500.0, "ppm", "the size of boards left out may be off by this", "V-A", 0)
+    max_anisotropy: float = knob(0.1, "", "focal lengths of a projector of diamond layout, whose units are square, that differ by more than this share speak of another layout", "", 0)
     tight_correlation: float = knob(0.95, "", "parameters correlated more than this are listed", "", 0, 1)
     permutations: int = knob(4000, "", "turned signs that a probability is made of, where there are too many to try all", "", 100, 1_000_000)
 
@@ -231,6 +232,8 @@ class VerifySettings(_Section):
     """Is a rig still true? (III-E)"""
 
     limit: float = knob(4e-5, "working distances", "views, corners or a sphere that differ systematically by more than this say that the rig has drifted: 20 um at 500 mm", "III-E", 1e-7, 0.1)
+    warn: float = knob(1e-5, "working distances", "views that differ systematically by less than this are as noise and surfaces leave them: 5 um at 500 mm; by more, and by more than the calibration promised, they are worth a warning", "III-E", 1e-7, 0.1)
+    warn_promised: float = knob(5.0, "", "the same, in errors between the views that the calibration predicted", "III-E", 1)
     limit_scale_ppm: float = knob(500.0, "ppm", "a board measured too large or too small by more than this, and three standard errors, says the same", "III-E", 0)
 
 

@@ -5,6 +5,6 @@ from fringescope.calibrate.holdout import fit_board, leave_one_out, sizes_of
 from fringescope.calibrate.numbering import agree
 from fringescope.calibrate.problem import Sizes
 from fringescope.calibrate.see import see
-from fringescope.calibrate.solve import solve
+from fringescope.calibrate.solve import check, solve
 
-__all__ = ["Sizes", "agree", "evidence", "fit_board", "leave_one_out", "see", "sizes_of", "solve"]
+__all__ = ["Sizes", "agree", "check", "evidence", "fit_board", "leave_one_out", "see", "sizes_of", "solve"]

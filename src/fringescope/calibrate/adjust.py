@@ -107,7 +107,7 @@ def released(
         priors |= {at + k: value for k, value in focal.get(d, {}).items()}
         priors |= {at + 2 + k: value for k, value in middle.get(d, {}).items()}
     if centres:
-        for k, sigma in _shape_terms(s).items():
+        for k, sigma in shape_terms(s).items():
             columns.append((problem.shape_at + k,))
             priors[problem.shape_at + k] = (0.0, sigma)
     for p in sorted({b.pose for b in problem.blocks}) if poses else ():
@@ -119,7 +119,8 @@ def released(
     return replace(problem, free=free, priors={i: v for i, v in priors.items() if held[i]})
 
 
-def _shape_terms(s: CalibrateSettings) -> dict[int, float]:
+def shape_terms(s: CalibrateSettings) -> dict[int, float]:
+    """Which terms of the board's shape are free, with the sigma of each; raises UsageError for a word there is not."""
     words = s.board_shape.split()
     if not set(words) <= {"flat", "bend", "print"} or not words:
         raise UsageError(f"setting board_shape: '{s.board_shape}'; needed flat, bend, print or \"bend print\"")

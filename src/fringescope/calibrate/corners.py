@@ -160,9 +160,10 @@ def _unusable(why: AnyArray, name: str) -> str:
     counts = Counter(str(w) for w in why if w)
     if counts["saturated"] > 0.5 * len(why):
         return f"{name}: the board is saturated ({counts['saturated']} of {len(why)} corners); expose it less"
-    listed = "".join(f"; {n} {w}" for w, n in counts.most_common(3))
+    listed = "".join(f"; {n}: {w}" for w, n in counts.most_common(3))
     good = len(why) - sum(counts.values())
-    return f"{name}: no board found: {good} of {len(why)} likely corners are some{listed}; show it in focus, evenly lit"
+    found = f"{good} of {len(why)} likely corners are real{listed}"
+    return f"{name}: no board found: {found}; show it in focus, evenly lit, hardly hidden"
 
 
 def _trim(index: I32, board: Board) -> I32:

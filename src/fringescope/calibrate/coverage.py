@@ -9,9 +9,10 @@ import numpy as np
 from fringescope import geometry
 from fringescope.calibrate import prediction, scatter
 from fringescope.settings import EvidenceSettings
-from fringescope.types import F64, Bool, Calibration, Camera, Coverage, Projector
+from fringescope.types import F64, Bool, Calibration, Camera, Coverage, Filled, Projector, Rig
 
 CELLS = (8, 6)  #: columns, rows
+VOLUME = (8, 6, 3)  #: cells of the measuring volume along its axes
 _COLUMNS, _ROWS = (("left", 0, 3), ("", 3, 5), ("right", 5, 8)), (("upper", 0, 2), ("", 2, 4), ("lower", 4, 6))
 
 
@@ -85,6 +86,40 @@ def _missing(cells: F64) -> tuple[str, ...]:
             if (part >= 0).sum() >= 2 and (part > 0).sum() < 0.25 * (part >= 0).sum():
                 out.append({"": "middle"}.get(row + column, f"{row} {column}".strip()))
     return tuple(out)
+
+
+# -------------------------------------------------------------------------------------------------------------- volume
+
+
+def filled(calibration: Calibration) -> Filled:
+    """How many poses reached each cell of the measuring volume, half a square around every corner that was seen."""
+    rig, board, v = calibration.rig, calibration.board, prediction.space(calibration)
+    middles = [(2 * np.arange(n) + 1) / n - 1 for n in VOLUME]
+    centres = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+    world = v.center + (centres.reshape(-1, 3) * v.half_size) @ v.axes
+    lit = np.any([geometry.field_of_view(Rig(rig.projector, (c,)), world) for c in rig.cameras], axis=0)
+    count = np.zeros(VOLUME, dtype=int)
+    step = np.linspace(-0.5, 0.5, 5) * board.square_mm
+    around = np.stack(np.meshgrid(step, step, [0.0], indexing="ij"), -1).reshape(-1, 3)
+    for pose, T in calibration.boards.items():
+        seen = [s.corner for s in calibration.sightings if s.pose == pose]
+        if not seen:
+            continue
+        corner = board.corner_mm(np.unique(np.concatenate(seen), axis=0))
+        p = geometry.transform(T, (corner[:, None] + around).reshape(-1, 3))
+        cell = np.floor(((p - v.center) @ v.axes.T / v.half_size + 1) / 2 * VOLUME).astype(int)
+        cell = np.unique(cell[((cell >= 0) & (cell < VOLUME)).all(axis=1)], axis=0)
+        count[tuple(cell.T)] += 1
+    needed = lit.reshape(VOLUME) | (count > 0)
+    share = float((count[needed] > 0).mean()) if needed.any() else 0.0
+    count = np.where(needed, count, -1)
+    middle, half = float(v.axes[2] @ v.center), float(v.half_size[2])
+    return Filled(
+        tuple(tuple(tuple(int(n) for n in row) for row in count[:, :, k].T) for k in range(VOLUME[2])),
+        tuple(float(z) for z in middle + np.linspace(-half, half, VOLUME[2] + 1)),
+        (2 * float(v.half_size[0]), 2 * float(v.half_size[1])),
+        share,
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------- tilt

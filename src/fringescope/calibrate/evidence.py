@@ -17,6 +17,7 @@ from fringescope.types import (
     Evidence,
     FieldTest,
     HeldOut,
+    Layout,
     PoseFigures,
     Prediction,
 )
@@ -53,6 +54,7 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
     """
     fields = tuple(scatter.field_test(v, s) for v in scatter.by_device(calibration))
     covered = coverage.coverage(calibration)
+    inside = coverage.filled(calibration)
     predicted = prediction.predict(calibration)
     poses = pose_figures(calibration, held_out)
     footprint = {c.name: pixel_mm(calibration, c) for c in calibration.rig.cameras}
@@ -63,6 +65,7 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
     _judge_prediction(w, predicted, footprint, s)
     _judge_poses(w, calibration, s)
     coverage.judge(w, calibration, covered, s)
+    _judge_layout(w, calibration, s)
     for word in _said(calibration):
         w.against(word, 0)
     pairs = correlations(calibration, s.tight_correlation)
@@ -76,7 +79,8 @@ def evidence(calibration: Calibration, held_out: Sequence[HeldOut], s: EvidenceS
         poses,
         pairs,
         predicted,
-        figures,
+        figures | {"volume reached": inside.share},
+        inside,
     )
 
 
@@ -117,7 +121,7 @@ def pose_figures(calibration: Calibration, held_out: Sequence[HeldOut]) -> tuple
         out.append(PoseFigures(
             pose,
             {s.camera: rms(np.hypot(*r.corner.T)) for s, r in mine if len(r.corner)},
-            {s.camera: rms(r.sample) for s, r in mine if r.sample.size},
+            {s.camera: rms(np.hypot(*scatter.along(s.directions, r.sample).T)) for s, r in mine if r.sample.size},
             sum(int(np.isfinite(r.corner).all(axis=1).sum()) for _, r in mine),
             sum(int(np.isfinite(r.sample).any(axis=1).sum()) for _, r in mine if r.sample.size),
             left.get(pose),
@@ -131,7 +135,8 @@ def pose_figures(calibration: Calibration, held_out: Sequence[HeldOut]) -> tuple
 def told(camera: str | None, points: int | None, why: str) -> str:
     """What was left out, in words."""
     where = f"{camera}: " if camera else ""
-    what = f"{points} points" if points is not None else ("the whole sighting" if camera else "the whole pose")
+    whole = "the whole sighting" if camera else "the whole pose"
+    what = whole if points is None else f"{points} point{'s' if points != 1 else ''}"
     return f"{where}{what} left out: {why}"
 
 
@@ -266,6 +271,15 @@ def _judge_prediction(
     elif finite:
         w.good.append(f"The calibration alone makes points uncertain by {_um(max(v[0] for v in finite))} (median), "
                       f"at most {_um(max(v[2] for v in finite))}.")  # fmt: skip
+
+
+def _judge_layout(w: _Words, calibration: Calibration, s: EvidenceSettings) -> None:
+    """The units of a diamond device's plane are square: focal lengths that differ tell another layout."""
+    p = calibration.rig.projector
+    ratio = float(p.lens.K[1, 1] / p.lens.K[0, 0])
+    if p.layout is Layout.DIAMOND and abs(ratio - 1) > s.max_anisotropy:
+        w.against(f"projector: fy is {ratio:.2f} fx, but the units of a diamond layout are square: is its layout grid?")
+        w.next.append("check the projector's layout in capture.json: with a wrong one guidelines come out elsewhere")
 
 
 def _judge_poses(w: _Words, calibration: Calibration, s: EvidenceSettings) -> None:

@@ -183,7 +183,8 @@ def _ends_fit(t: Turn, found: Corners, ends: Bool, board: Board) -> bool:
 def _other_board(extent: I32, board: Board, name: str) -> str:
     return (
         f"{name}: the picture shows {max(extent)} x {min(extent)} inner corners, board.json says "
-        f"{board.inner_corners[0]} x {board.inner_corners[1]}; count the inner corners and correct board.json"
+        f"{board.inner_corners[0]} x {board.inner_corners[1]}; count them and correct board.json, or "
+        "show more of the board if a part of it is hidden"
     )
 
 

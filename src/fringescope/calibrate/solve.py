@@ -24,6 +24,7 @@ from fringescope.calibrate.adjust import (
     residuals,
     robust_noise,
     settle,
+    shape_terms,
     thinned,
 )
 from fringescope.calibrate.problem import (
@@ -39,12 +40,14 @@ from fringescope.calibrate.problem import (
     minimise,
     sample_block,
 )
+from fringescope.calibrate.squares import SMALL
 from fringescope.errors import CalibrationError, UsageError
 from fringescope.settings import CalibrateSettings
 from fringescope.types import F64, Board, Calibration, LeftOut, Sighting
 
 COARSE = 120  #: samples of each picture while the solve looks for its way
 CHOOSING = 250  #: and while lens models are compared
+LEAST_ANGLE = 0.1  #: sine of it: directions of fringes nearer than this tell one coordinate
 FEWEST_CORNERS = 6  #: a picture with fewer says too little
 
 
@@ -57,9 +60,11 @@ def solve(sightings: Sequence[Sighting], board: Board, sizes: Sizes, s: Calibrat
     poses, UsageError for settings that cannot mean anything.
     """
     s = s or CalibrateSettings()
-    asked_models(0, s)
+    check(s)
     used, left = _able(sightings, sizes)
     problem = make_problem(used, board, sizes, s)
+    _two_directions(used)
+    _phase_seen(problem, used)
     _enough(problem, s, left)
     focal, pinned = _pins(problem, s)
     coarse = thinned(problem, COARSE)
@@ -117,10 +122,17 @@ def _crooked(n: Sighting) -> str | None:
     return f"corners {miss:.2g} px off a flat grid: numbered wrongly" if miss > 0.15 * span else None
 
 
-def make_problem(used: Sequence[Sighting], board: Board, sizes: Sizes, s: CalibrateSettings) -> Problem:
-    """The measurements of sightings as blocks; each block's `sighting` counts `used`."""
+def check(s: CalibrateSettings) -> None:
+    """Raises UsageError for settings that cannot mean anything, whatever the pictures show."""
+    asked_models(2, s)
+    shape_terms(s)
     if s.projector not in ("samples", "centres", "corners"):
         raise UsageError(f"setting projector: '{s.projector}'; needed samples, centres or corners")
+
+
+def make_problem(used: Sequence[Sighting], board: Board, sizes: Sizes, s: CalibrateSettings) -> Problem:
+    """The measurements of sightings as blocks; each block's `sighting` counts `used`."""
+    check(s)
     poses = tuple(sorted({n.pose for n in used}))
     names = list(sizes.cameras)
     blocks: list[Block] = []
@@ -159,13 +171,34 @@ def _enough(problem: Problem, s: CalibrateSettings, left: Sequence[LeftOut]) -> 
             f"{len(poses)} usable poses of the board; needed {s.min_poses} at least, eight to ten are good"
             + (f" (left out: {why})" if why else "")
         )
-    if not any(b.kind == PHASE for b in problem.blocks):
-        raise CalibrationError("no picture has the projector's phase on the board; project fringes along both u and v")
     for c, name in enumerate(problem.sizes.cameras, start=1):
         n = len({b.pose for b in problem.blocks if b.device == c})
         if n < s.min_poses:
             because = f" (left out: {why})" if why else ""
             raise CalibrationError(f"{name} has {n} usable poses of the board; needed {s.min_poses} at least{because}")
+
+
+def _two_directions(used: Sequence[Sighting]) -> None:
+    """Raises CalibrationError where no picture has fringes along two directions."""
+    every = [n.directions / np.linalg.norm(n.directions, axis=1, keepdims=True) for n in used if len(n.directions)]
+    if every and all(np.abs(g[:, 1] * g[0, 0] - g[:, 0] * g[0, 1]).max() < LEAST_ANGLE for g in every):
+        g = every[0][0]
+        raise CalibrationError(
+            f"fringes along one direction only came ({g[0]:.2f}, {g[1]:.2f}); needed two: project fringes along both "
+            "u and v in every pose"
+        )
+
+
+def _phase_seen(problem: Problem, used: Sequence[Sighting]) -> None:
+    """Raises CalibrationError where no picture has the projector's phase on the board, with what was said of them."""
+    if not used or any(b.kind == PHASE for b in problem.blocks):
+        return
+    n, words = next(((n, w) for n in used for w in [[w for w in n.words if "white square" in w]] if w), (used[0], []))
+    cure = "project fringes along both u and v"
+    if any(SMALL in w for w in words):
+        cure = "take a board of larger squares, or a lens or place that shows them larger"
+    seen = f"{n.name}: {'; '.join(words)}; " if words else ""
+    raise CalibrationError(f"no picture has the projector's phase on the board; {seen}{cure}")
 
 
 def _tilted(problem: Problem, state: State, s: CalibrateSettings) -> None:

@@ -15,6 +15,7 @@ from fringescope.calibrate.lattice import terms as monomials
 from fringescope.settings import BoardSettings
 from fringescope.types import F32, F64, I32, Board, Bool, Decoded, Reason
 
+SMALL = "too small in the picture"
 MOST_PIXELS = 1500  #: of one square that are looked at; larger squares are strided
 USABLE = ~int(Reason.ORDER_UNCERTAIN) & 0xFFFF  #: an uncertain order is judged by the whole board's phase instead
 SHARE = 0.25  #: cycles: a phase this near to whole cycles off the board's model is repaired
@@ -61,7 +62,8 @@ def measure(image: F32, decoded: Decoded, found: Corners, board: Board, s: Board
     usual = _usual([f.rough for f in fits])
     keep = [bool((f.rough <= s.phase_rough * usual).all()) for f in fits]
     words["phase is not smooth (highlight, dirt, movement)"] += len(keep) - sum(keep)
-    said = [f"{n} white square{'s' if n > 1 else ''} left out: {w}" for w, n in words.items() if n]
+    told = {w: _too_small(found, board, s) if w == SMALL else w for w in words}
+    said = [f"{n} white square{'s' if n > 1 else ''} left out: {told[w]}" for w, n in words.items() if n]
     if repaired:
         said.append(f"{repaired} phases a whole number of cycles off the board were repaired")
     if dropped:
@@ -103,15 +105,15 @@ def _area(
     side = float(np.sqrt(cv2.contourArea(outline.astype(np.float32))))
     block = (slice(y0, y1 + 1), slice(x0, x1 + 1))
     x, y = np.meshgrid(np.arange(x0, x1 + 1, dtype=np.float64), np.arange(y0, y1 + 1, dtype=np.float64))
-    clear = (s.edge_pixels + found.blur) if not board.dictionary else max(1.0, 2.4 * math.hypot(found.blur, 0.3))
+    clear = _clear(found, board, s)
     inset = max(s.edge_clearance * side if not board.dictionary else 0.0, clear)
     inside = _inside(outline, x, y, inset)
-    if inside.sum() < s.min_square_pixels and not board.dictionary:
-        words["too small in the picture"] += 1
-        return None
     if board.dictionary:
         inside &= _white(image[block], found, clear)
-    elif image[block][inside].size:
+    if inside.sum() < s.min_square_pixels:
+        words[SMALL] += 1
+        return None
+    if not board.dictionary and image[block][inside].size:
         level = float(np.median(image[block][inside]))
         inside &= image[block] > 0.5 * level
     reasons = decoded.reasons[block]
@@ -134,6 +136,26 @@ def _area(
     px = np.column_stack([x[ok], y[ok]])
     pick = np.arange(0, len(px), len(px) // MOST_PIXELS + 1)
     return Area(square, px[pick], phase[ok][pick], sigma[ok][pick])
+
+
+def _clear(found: Corners, board: Board, s: BoardSettings) -> float:
+    """How far from any edge phases are clean, pixels."""
+    return max(1.0, 2.4 * math.hypot(found.blur, 0.3)) if board.dictionary else s.edge_pixels + found.blur
+
+
+def _too_small(found: Corners, board: Board, s: BoardSettings) -> str:
+    """How wide squares are in the picture, and how wide they should be to leave anything clean."""
+    i = found.index[:, None] - found.index[None]
+    far = np.linalg.norm(found.px[:, None] - found.px[None], axis=2)
+    side = float(np.median(far[np.abs(i).sum(-1) == 1]))
+    clear = _clear(found, board, s)
+    if board.dictionary:
+        needed = (2 * clear + 0.4) / (0.5 * (1 - board.marker_mm / board.square_mm))
+        part = "for the white rim of a marker"
+    else:
+        width = math.sqrt(s.min_square_pixels)
+        needed, part = max(width + 2 * clear, width / (1 - 2 * s.edge_clearance)), "clear of their edges"
+    return f"{SMALL} ({side:.0f} pixels wide; needed about {max(needed, side + 1):.0f}, {part})"
 
 
 def _inside(outline: F64, x: F64, y: F64, inset: float) -> Bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +16,6 @@ from fringescope.cli.app import app
 from fringescope.cli.common import (
     Force,
     Json,
-    Out,
     Progress,
     ResponseFile,
     SetOption,
@@ -24,7 +25,7 @@ from fringescope.cli.common import (
     load_response,
     load_settings,
 )
-from fringescope.errors import CalibrationError, CaptureError, DecodeError, UsageError
+from fringescope.errors import CalibrationError, CaptureError, DecodeError, FormatError, UsageError
 
 if TYPE_CHECKING:
     from fringescope import evaluate as judging
@@ -54,18 +55,19 @@ def look(session: Session, s: Settings, progress: Progress, response: Response |
     """
     from fringescope import pipeline, store
 
-    out = Looked()
-    inputs = [(pose, v) for pose, capture in session.poses for v in store.view_inputs(capture, response)]
+    out = Looked(wrong=dict(session.left_out))
+    plain = [(p, replace(c, views=tuple(replace(v, color=None) for v in c.views))) for p, c in session.poses]
+    inputs = [(pose, v) for pose, capture in plain for v in store.view_inputs(capture, response)]
     for pose, view in progress.track(inputs, "looking at the boards", len(inputs)):
         name = f"{pose}/{view.plan.camera}"
         try:
             found, mean, why = pipeline.see_board(view, session.board, pose, s)
         except (CaptureError, DecodeError) as e:
-            out.wrong[name] = str(e)
+            out.wrong[name] = str(e).removeprefix(f"{name}: ")
             continue
         out.pictures[name] = _reduced(mean)
         if found is None:
-            out.wrong[name] = why
+            out.wrong[name] = why.removeprefix(f"{name}: ")
         else:
             out.seen.append(found)
     return out
@@ -115,11 +117,13 @@ def rig_with_evidence(c: Calibration, evidence: Evidence, s: Settings) -> Rig:
     from fringescope.settings import to_dict
 
     doc = store.calibration_document(c)
+    predicted = evidence.prediction
     doc["calibration"] |= {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"fringescope": __version__},
         "settings": {k: v for k, v in to_dict(s).items() if k in ("board", "calibrate")},
         "verdict": evidence.verdict,
+        "predicted_views_um": {k: m for k, (m, _) in predicted.views_um.items()} if predicted is not None else {},
         "held_out": [asdict(p.held_out) for p in evidence.poses if p.held_out is not None],
     }
     return replace(c.rig, extra={**c.rig.extra, **doc})
@@ -130,7 +134,7 @@ def calibrate(
     session: Annotated[
         Path, typer.Argument(help="A folder with board.json and a capture per pose; or a rig.json, to solve it again.")
     ],
-    out: Out,
+    out: Annotated[Path, typer.Option("--out", help="The rig.json to write.", show_default=False)],
     report: Annotated[
         Path | None, typer.Option(help="The report, a page for any browser; else beside the rig, as RIG.html.")
     ] = None,
@@ -141,12 +145,14 @@ def calibrate(
     json: Json = False,
 ) -> None:
     """Board captures to a calibrated rig, with the evidence to trust it."""
+    from fringescope import calibrate as calibrate_
     from fringescope import pipeline, store
     from fringescope import report as report_
 
     s = load_settings(settings, set_)
+    calibrate_.check(s.calibrate)
     existing(session, "a session: a folder with board.json and a capture per pose")
-    title = session.resolve().name
+    title = _title(session.resolve())
     page = report if report is not None else out.with_suffix(".html")
     if page.resolve() == out.resolve():
         raise UsageError(f"--report {page} is the rig itself; name another file")
@@ -164,18 +170,43 @@ def calibrate(
                 c, evidence = pipeline.calibrate_rig(looked.seen, board, sizes, s, progress.share, why)
                 store.write_json(rig_file, store.rig_document(rig_with_evidence(c, evidence, s)))
                 text = report_.calibration_page(
-                    c, evidence, c.sightings, None, overlays(looked, c), f"Calibration of {title}", looked.wrong
+                    c, evidence, c.sightings, None, overlays(looked, c), title, looked.wrong
                 )
                 page_file.write_text(text, encoding="utf-8")
-        except (CalibrationError, CaptureError, DecodeError) as e:
-            failure = str(e)
+        except (CalibrationError, CaptureError, DecodeError, FormatError) as e:
+            if session.is_file() and isinstance(e, FormatError):  # a file, not a session: there is nothing to report on
+                raise
+            failure = "; ".join([str(e), *_reasons(looked, str(e))])
             text = report_.calibration_page(
-                None, None, looked.seen, failure, overlays(looked, None), f"Calibration of {title}", looked.wrong
+                None, None, looked.seen, failure, overlays(looked, None), title, looked.wrong
             )
             page_file.write_text(text, encoding="utf-8")
     if failure:
         raise CalibrationError(f"{failure}; see {page}")
     emit(_told(c, evidence, why, out, page), json, _lines(c, evidence, why, out, page))
+
+
+def _title(session: Path) -> str:
+    """What a report is called: by its session's folder, or the one above a session that is named for what it is."""
+    plain = session.name.lower() in ("calibration", "session") and session.parent.name
+    return f"Calibration of {session.parent.name if plain else session.name}"
+
+
+def _reasons(looked: Looked, said: str) -> list[str]:
+    """Of each camera that the failure `said` names, the most frequent reason why its pictures show no board."""
+    of: dict[str, list[str]] = {}
+    for name, why in looked.wrong.items():
+        if "/" in name:
+            of.setdefault(name.split("/", 1)[1], []).append(why)
+    out = []
+    for camera, every in of.items():
+        kinds = Counter(re.sub(r"[\d.]+", "0", why) for why in every)  # the same reason with other figures
+        kind, count = kinds.most_common(1)[0]
+        why = next(w for w in every if re.sub(r"[\d.]+", "0", w) == kind)
+        total = len(every) + sum(s.camera == camera for s in looked.seen)
+        if why not in said and (camera in said or 2 * len(every) > total):
+            out.append(f"{camera}, {count} of {total} pictures: {why}")
+    return list(dict.fromkeys(out))
 
 
 def _observations(rig: Path, looked: Looked) -> tuple[Board, Sizes]:
@@ -215,9 +246,13 @@ def _lines(c: Calibration, evidence: Evidence, wrong: list[str], out: Path, page
     lines = [f"{out}: {evidence.verdict}; {len(c.boards)} poses, {len(c.rig.cameras)} cameras; report: {page}"]
     lines += [f"without {w}" for w in wrong]
     lines += [f"without {x.pose}{'/' + x.camera if x.camera else ''}"
-              f"{f' ({x.points} points)' if x.points else ''}: {x.why}" for x in c.left_out]  # fmt: skip
+              f"{_points(x.points)}: {x.why}" for x in c.left_out]  # fmt: skip
     lines += [*evidence.good, *evidence.weak]
     return lines + [f"next: {w}" for w in evidence.next]
+
+
+def _points(n: int | None) -> str:
+    return f" ({n} point{'s' if n > 1 else ''})" if n else ""
 
 
 # -------------------------------------------------------------------------------------------------------------- verify

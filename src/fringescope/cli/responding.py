@@ -181,8 +181,10 @@ def response(
         str | None, typer.Option(help="The sets of a white plane were drawn to these powers, as in 1.3333,0.8.")
     ] = None,
     drawn: Annotated[
-        float, typer.Option(help="The fringes to be corrected are drawn to this power (1: plain sinusoids).")
-    ] = 1.0,
+        str,
+        typer.Option(help="The fringes to be corrected are drawn to this power (1: plain sinusoids); measured: to the "
+                     "gamma that this run finds, as tools draw that were set to their own measurement."),
+    ] = "1",
     levels: Annotated[str, typer.Option(help="Darkest and brightest level drawn, of 255.")] = "0,255",
     steps: Annotated[str | None, typer.Option(help="Of loose images: steps of each set, as in 3,3.")] = None,
     periods: Annotated[str | None, typer.Option(help="Of loose images: period of each set, as in 240,240.")] = None,
@@ -208,8 +210,7 @@ def response(
     span = numbers(levels, "--levels", float)
     if len(span) != 2 or not 0 <= span[0] < span[1] <= 255:
         raise UsageError(f"--levels {levels}; needed the darkest and the brightest of 0 to 255, as in 8,247")
-    if not 0.05 <= drawn <= 20:
-        raise UsageError(f"--drawn {drawn:g}; needed a power of 0.05 to 20")
+    given = None if drawn == "measured" else _power(drawn)
     if staircase is not None and exponents is not None:
         raise UsageError("--staircase and --exponents: needed one of them")
     fmt, drawn_levels = pixel_format(pixel_format_), (span[0] / 255, span[1] / 255)
@@ -238,11 +239,13 @@ def response(
             if not every:
                 raise EmptyResultError(f"{source}: " + "; ".join(failed))
             name, found = _best(every)
-        if drawn != 1.0:
-            found = stage.drawn_to_power(found, drawn)
-        doc = store.response_document(found, stage.predistortion(found).tolist()) | {
+        table = stage.predistortion(found).tolist()  # the device's own, whatever the fringes are drawn to
+        power = found.gamma if given is None else given
+        if power != 1.0:
+            found = stage.as_drawn(found, power, s.response)
+        doc = store.response_document(found, table) | {
             "camera": name,
-            "drawn_to_power": drawn,
+            "drawn_to_power": power,
             "views": {c: _brief(r) for c, r in every.items()},
         }
         if report is not None:
@@ -253,6 +256,17 @@ def response(
         with store.new_file(out, force=force) as tmp:
             store.write_json(tmp, doc)
     emit({"response": str(out), **doc}, json, [f"{out}: from {found.source}, {found.pixels} pixels", *found.words])
+
+
+def _power(text: str) -> float:
+    """The number of --drawn. Raises UsageError."""
+    try:
+        power = float(text)
+    except ValueError:
+        power = 0.0
+    if not 0.05 <= power <= 20:
+        raise UsageError(f"--drawn {text}; needed a power of 0.05 to 20, or measured")
+    return power
 
 
 def _brief(r: Response) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from fringescope.types import (
     Coverage,
     Evidence,
     FieldTest,
+    Filled,
     Parameter,
     PoseFigures,
     Prediction,
@@ -60,7 +61,8 @@ def calibration_page(
         parts += failed(failure or "no calibration came of it", sightings, overlays or {}, blind or {})
     else:
         parts += [_verdict(evidence), _words(evidence), _rig(calibration), _devices(calibration, evidence)]
-        parts += [_predicted(evidence.prediction), _poses(evidence.poses), _parameters(calibration, evidence)]
+        parts += [_filled(evidence.filled), _predicted(evidence.prediction), _poses(evidence.poses)]
+        parts.append(_parameters(calibration, evidence))
     parts.append(pictures(calibration, sightings, overlays or {}, blind or {}))
     parts.append(f"<footer>{LIMITS} Made by Fringescope {escaped(__version__)}.</footer>")
     page = (resources.files("fringescope.report") / "calibration.html").read_text(encoding="utf-8")
@@ -233,7 +235,25 @@ def _p(p: float) -> str:
     return "–" if not math.isfinite(p) else "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-# ----------------------------------------------------------------------------------------------------------- prediction
+# --------------------------------------------------------------------------------------------------- volume, prediction
+
+
+def _filled(f: Filled | None) -> str:
+    """Layers of the measuring volume, y upwards as on the maps below."""
+    if f is None:
+        return ""
+    w, h = f.size_mm
+    plots = [
+        figure("mid", f"z from <b>{number(low)}</b> to <b>{number(high)}</b> mm".replace("-", "−"),
+               svg.cells(layer[::-1], (max(round(w), 1), max(round(h), 1))))
+        for layer, low, high in zip(f.layers, f.edges_mm[:-1], f.edges_mm[1:], strict=True)
+    ]  # fmt: skip
+    return (
+        f'<h2>The measuring volume</h2><p class="lead">Boards reached <b>{100 * f.share:.0f} %</b> of its cells, '
+        f"{number(w)} x {number(h)} mm wide. Darker: more poses; orange: none; hatched: no camera sees it in the "
+        "projector’s light. Points are worth most where boards were.</p>"
+        f'<section class="card"><div class="plots">{"".join(plots)}</div></section>'
+    )
 
 
 def _predicted(p: Prediction | None) -> str:
@@ -301,15 +321,19 @@ def _poses(poses: Sequence[PoseFigures]) -> str:
         figures = "".join(_cell(values[i], m) for (_, values), m in zip(columns, usual, strict=True))
         rows.append(
             f"<tr><td>{escaped(p.pose)}</td><td>{number(math.degrees(p.tilt_rad))}</td><td>{number(p.depth_mm, 4)}</td>"
-            f"<td>{p.corners}</td>{figures}<td class=note>{micro('; '.join(p.notes))}</td></tr>"
+            f"<td>{p.corners}</td>{figures}</tr>"
         )
+        if p.notes:
+            said = f"<td class=note colspan={len(columns) + 3}>{micro('; '.join(p.notes))}</td>"
+            rows.append(f"<tr class=under><td></td>{said}</tr>")
     head = "".join(f"<th>{n}</th>" for n, _ in columns)
     return (
         '<h2>Pose by pose</h2><p class="lead">Root mean squares: corners in pixels of the camera, phase in units of '
-        "the projector’s plane. Marked: more than twice what is usual. “Left out”: the pose was taken out of the "
+        "the projector’s plane, both as lengths of vectors. Below a pose: what of it was not used, and why. Marked: "
+        "more than twice what is usual. “Left out”: the pose was taken out of the "
         "solve, and its board then measured with the rig of the others.</p>"
         '<section class="card"><div class="scroll"><table><tr><th>pose</th><th>tilt, °</th><th>depth, mm</th>'
-        f"<th>corners</th>{head}<th class=note>not used, and why</th></tr>"
+        f"<th>corners</th>{head}</tr>"
         f"{''.join(rows)}</table></div></section>"
     )
 

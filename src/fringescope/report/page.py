@@ -59,7 +59,7 @@ def pictures(
     data = _encoded(overlays)
     left: dict[str, list[str]] = {}
     for o in c.left_out if c is not None else ():
-        why = f"{'the sighting' if o.points is None else f'{o.points} points'} left out: {o.why}"
+        why = f"{'the sighting' if o.points is None else f'{o.points} point' + 's' * (o.points != 1)} left out: {o.why}"
         for n in names:
             if n.split("/")[0] == o.pose and (o.camera is None or n == f"{o.pose}/{o.camera}"):
                 left.setdefault(n, []).append(why)
@@ -131,7 +131,8 @@ def failed(
         mine = [there.get((pose, k)) for k in cameras]
         found = "".join(f"<td>{len(s.corner)} · {len(s.square)}</td>" if s else "<td class=far>none</td>" for s in mine)
         said = {k: s.words if s else (blind.get(f"{pose}/{k}", ""),) for k, s in zip(cameras, mine, strict=True)}
-        words = "; ".join(f"{k}: {w}" for k, each in said.items() for w in each if w)
+        of_pose = [blind[pose]] if pose in blind else []
+        words = "; ".join([*of_pose, *(f"{k}: {w}" for k, each in said.items() for w in each if w)])
         rows.append(f"<tr><td>{escaped(pose)}</td>{found}<td class=note>{micro(words)}</td></tr>")
     out.append(
         '<h2>What was found</h2><p class="lead">Corners · white squares in each picture.</p>'

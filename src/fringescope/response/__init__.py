@@ -4,7 +4,7 @@
 phases from its error before their orders are settled; `predistortion` is the table that makes the projector linear.
 """
 
-from fringescope.response.judge import from_exponents, from_fringes, from_sets
+from fringescope.response.judge import as_drawn, from_exponents, from_fringes, from_sets
 from fringescope.response.model import (
     correct,
     curve,
@@ -24,6 +24,7 @@ from fringescope.response.staircase import from_staircase
 
 __all__ = [
     "Ripple",
+    "as_drawn",
     "correct",
     "corrected",
     "curve",

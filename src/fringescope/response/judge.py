@@ -193,6 +193,22 @@ def words(r: Response, sets: Mapping[int, tuple[float, float]], s: ResponseSetti
         yield "the bright end is flat: projector or camera saturates: halve the exposure, or draw less bright"
 
 
+def as_drawn(r: Response, exponent: float, s: ResponseSettings) -> Response:
+    """The response as fringes show it that are drawn to a power (`drawn_to_power`), with the verdict and the words of
+    these fringes; what was not proved of the response is not proved of them.
+    """
+    out = model.drawn_to_power(r, exponent)
+    steps = [int(n) for n in r.figures.get("sets", {}) if int(n) in out.error_rad] or [min(out.error_rad)]
+    sets = {n: (out.error_rad[n], out.error_sigma[n]) for n in steps}
+    great = any(e > max(s.negligible_rad, s.significance * d) for e, d in sets.values())
+    unproved = r.figures.get("verdict") == "unproved" or r.saturated > BLOWN
+    verdict = "unproved" if unproved else "needed" if great else "fine"
+    told = {str(n): {"error_rad": e, "sigma_rad": d} for n, (e, d) in sets.items()}
+    out = replace(out, needed=verdict == "needed", figures={**r.figures, "verdict": verdict, "sets": told})
+    first, *rest = words(out, sets, s)
+    return replace(out, words=(f"as fringes drawn to the power {exponent:.4g} show it: {first}", *rest))
+
+
 def flat_end(r: Response) -> float:
     """Slope of the curve at 95 % of the drawn range over that at half of it, relative to the power law's."""
     x = np.array([0.45, 0.55, 0.9, 1.0])

@@ -9,7 +9,7 @@ phase is wrong by `Im log(1 + x)`: for three steps about `-(h_2 - h_4) sin 3 phi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -187,12 +187,25 @@ def predicted_errors(h: F64, steps: Sequence[int] = (3, 4, 5, 8)) -> Mapping[int
 
 def drawn_to_power(response: Response, exponent: float) -> Response:
     """The response as fringes show it that are drawn to a power, `((1 + cos) / 2) ** exponent`: 1 / gamma makes most
-    responses linear. Predicted errors follow; words and figures stay.
+    responses linear. Sigmas (errors of harmonics taken as independent) and predicted errors follow; words and figures
+    stay.
     """
-    h = redrawn(np.asarray(response.harmonics), exponent)
+    own, sigma = np.asarray(response.harmonics), np.zeros(len(response.harmonics))
+    sigma[: len(response.sigmas)] = response.sigmas[: len(sigma)]
+
+    def spread(f: Callable[[F64], F64]) -> F64:
+        moves = [(f(own + step) - f(own - step)) / 2 for step in np.diag(np.maximum(sigma, 1e-9))]
+        return np.asarray(np.sqrt(np.sum(np.square(moves), axis=0)))
+
+    steps = tuple(response.error_rad) or (3, 4, 5, 8)
+    h = redrawn(own, exponent)
+    errors = spread(lambda h: np.array([greatest_error(redrawn(h, exponent), n) for n in steps]))
     return replace(
         response,
         gamma=response.gamma * exponent,
+        gamma_sigma=response.gamma_sigma * exponent,
         harmonics=tuple(h.tolist()),
-        error_rad=predicted_errors(h),
+        sigmas=tuple(spread(lambda h: redrawn(h, exponent)).tolist()),
+        error_rad=predicted_errors(h, steps),
+        error_sigma=dict(zip(steps, errors.tolist(), strict=True)),
     )

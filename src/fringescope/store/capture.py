@@ -155,6 +155,14 @@ def read_capture(path: Path | str) -> Capture:
     and channels fit the view. File names must stay inside the folder. Raises FormatError for the document, CaptureError
     for plans and frames.
     """
+    capture, lost = read_usable(path)
+    for why in lost.values():
+        raise CaptureError(why)
+    return capture
+
+
+def read_usable(path: Path | str) -> tuple[Capture, dict[str, str]]:
+    """As `read_capture`, less the views of which a frame is missing or does not fit; these by name, with the reason."""
     path = Path(path)
     document = path / files.CAPTURE if path.is_dir() else path
     m = read_model(document, "a capture (a folder with capture.json)", FORMAT, VERSION, _Capture)
@@ -162,15 +170,23 @@ def read_capture(path: Path | str) -> Capture:
     layout = parse_layout(p.layout, document)
     images = Images(document.parent)
     size = plane_size(p.width, p.height, layout)
-    views = tuple(_view(v, i, m.noise, size, document, images) for i, v in enumerate(m.views))
-    names = [v.camera for v in views]
+    views: list[CaptureView] = []
+    lost: dict[str, str] = {}
+    for i, v in enumerate(m.views):
+        plan, named = _plan(v, i, size, document)
+        try:
+            views.append(_view(v, plan, named, v.noise or m.noise, f"{document}: views[{i}]", images))
+        except CaptureError as e:
+            lost[v.camera] = str(e)
+    names = [v.camera for v in m.views]
     if len(set(names)) != len(names):
         raise CaptureError(f"{document}: cameras {', '.join(names)}: not unique; needed one view per camera")
     extra = MappingProxyType(dict(m.model_extra or {}))
-    return Capture(document.parent, document, p.width, p.height, layout, views, extra, images=images)
+    return Capture(document.parent, document, p.width, p.height, layout, tuple(views), extra, images=images), lost
 
 
-def _view(m: _View, i: int, noise: _Noise | None, size: tuple[int, int], document: Path, images: Images) -> CaptureView:
+def _plan(m: _View, i: int, size: tuple[int, int], document: Path) -> tuple[ViewPlan, tuple[str, ...]]:
+    """The plan of a view and the files of its frames, whether they are there or not."""
     where = f"{document}: views[{i}]"
     if bad := files.check_name(m.camera):
         raise CaptureError(f"{where}.camera {files.shown(m.camera)}: {bad}")
@@ -199,18 +215,24 @@ def _view(m: _View, i: int, noise: _Noise | None, size: tuple[int, int], documen
     for n in every:
         if bad := files.check_relative(n):
             raise CaptureError(f"{where}: frame {files.shown(n)}: {bad}")
+    return plan, tuple(names)
+
+
+def _view(
+    m: _View, plan: ViewPlan, names: tuple[str, ...], noise: _Noise | None, where: str, images: Images
+) -> CaptureView:
+    every = names if m.color is None else (*names, m.color)
     view_size: tuple[int, int] | None = None
     for n in every:
         head = images.header(n)
-        check_header(head, fmt, view_size, str(images.folder / n))
+        check_header(head, plan.pixel_format, view_size, str(images.folder / n))
         view_size = view_size or (head.width, head.height)
-    n_ = m.noise or noise
-    model = None if n_ is None else NoiseModel(n_.a, n_.b, files.CAPTURE)
+    model = None if noise is None else NoiseModel(noise.a, noise.b, files.CAPTURE)
     assert view_size is not None  # a plan has at least one frame
     if min(view_size) < LEAST_SIDE:
         came = f"frames of {view_size[0]} x {view_size[1]} pixels"
         raise CaptureError(f"{where}: {came}; needed at least {LEAST_SIDE} rows and columns of an area camera")
-    return CaptureView(plan, tuple(names), view_size, m.color, model)
+    return CaptureView(plan, names, view_size, m.color, model)
 
 
 def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:

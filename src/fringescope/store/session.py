@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import binascii
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fringescope.errors import CalibrationError, FormatError
 from fringescope.store import files
-from fringescope.store.capture import Capture, read_capture
+from fringescope.store.capture import Capture, read_usable
 from fringescope.store.rig import explain
 from fringescope.types import AnyArray, Board, Calibration, Sighting
 
@@ -35,12 +35,16 @@ class _Board(BaseModel):
 
 @dataclass(frozen=True)
 class Session:
-    """Board captures, one per pose, in the order of their names. `sizes` maps camera names to (width, height)."""
+    """Board captures, one per pose, in the order of their names. `sizes` maps camera names to (width, height).
+
+    `left_out` says why a pose ("pose03") or one camera's picture of it ("pose03/camera1") is not among them.
+    """
 
     folder: Path
     board: Board
     poses: tuple[tuple[str, Capture], ...]
     sizes: Mapping[str, tuple[int, int]]
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 def parse_board(doc: Mapping[str, Any], path: Path) -> Board:
@@ -85,6 +89,7 @@ def read_board(path: Path | str) -> Board:
 def read_session(path: Path | str, board: Board | None = None) -> Session:
     """A folder with `board.json` and one capture per pose; `board` stands in for the file.
 
+    Pictures that lack a frame, and folders called like the poses without a capture, are left out by name.
     Raises FormatError or CaptureError for a file that is wrong, CalibrationError for captures that do not belong
     together: another projector, a camera whose pictures change size.
     """
@@ -98,7 +103,13 @@ def read_session(path: Path | str, board: Board | None = None) -> Session:
     names = sorted(p.name for p in folder.iterdir() if (p / files.CAPTURE).is_file())
     if not names:
         raise FormatError(f"{folder}: no captures in it; needed a folder with {files.CAPTURE} per pose (pose00/, ..)")
-    poses = tuple((n, read_capture(folder / n)) for n in names)
+    left_out = dict.fromkeys(_empty(folder, names), f"no {files.CAPTURE} in it; it describes the frames")
+    read: list[tuple[str, Capture]] = []
+    for n in names:
+        capture, lost = read_usable(folder / n)
+        read.append((n, capture))
+        left_out |= {f"{n}/{camera}": why for camera, why in lost.items()}
+    poses = tuple(read)
     sizes: dict[str, tuple[int, int]] = {}
     first_of: dict[str, str] = {}
     first = poses[0][1]
@@ -117,7 +128,16 @@ def read_session(path: Path | str, board: Board | None = None) -> Session:
                     f"{w} x {h}; capture every pose at one size"
                 )
             first_of.setdefault(v.camera, name)
-    return Session(folder, board, poses, sizes)
+    return Session(folder, board, poses, sizes, left_out)
+
+
+def _empty(folder: Path, poses: Sequence[str]) -> list[str]:
+    """Folders without a capture whose names differ from those of poses by their digits alone."""
+    kinds = {n.rstrip("0123456789") for n in poses}
+    return sorted(
+        p.name for p in folder.iterdir()
+        if p.is_dir() and p.name not in poses and p.name.rstrip("0123456789") in kinds
+    )  # fmt: skip
 
 
 def _projector(c: Capture) -> str:

@@ -217,6 +217,20 @@ class Coverage:
 
 
 @dataclass(frozen=True)
+class Filled:
+    """How many poses reached each cell of the measuring volume: layers along its last axis, rows along its
+    second.
+
+    -1 = a cell that no camera sees in the projector's light, which needs none. `edges_mm` (layers + 1,).
+    """
+
+    layers: tuple[tuple[tuple[int, ...], ...], ...]
+    edges_mm: tuple[float, ...]
+    size_mm: tuple[float, float]  #: of the volume along the first two axes
+    share: float  #: of the cells that matter
+
+
+@dataclass(frozen=True)
 class Slice:
     """Predicted systematic sigma of points in one plane of the measuring volume: (rows, columns) in um; NaN = unseen.
 
@@ -245,7 +259,10 @@ class Prediction:
 
 @dataclass(frozen=True)
 class PoseFigures:
-    """One row of the report's table: residuals per camera, corners in pixels and phase in projector-plane units."""
+    """One row of the report's table: residuals per camera, corners in pixels and phase in projector-plane units.
+
+    Both are lengths of vectors, as in `FieldTest`.
+    """
 
     pose: str
     corner_px: Mapping[str, float]
@@ -275,3 +292,4 @@ class Evidence:
     correlations: tuple[tuple[str, str, float], ...]  #: pairs of parameters, |rho| largest first
     prediction: Prediction | None
     figures: Mapping[str, float] = field(default_factory=dict)
+    filled: Filled | None = None
