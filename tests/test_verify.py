@@ -203,7 +203,7 @@ def test_rendered_captures(shared, tmp_path, capsys) -> None:
     assert cli.run(["verify", str(data / "sphere"), "--rig", str(truth), "--sphere-mm", "12", "--json"]) == 0
     out = json.loads(capsys.readouterr().out)
     assert out["verdict"] == "ok"
-    assert out["inter_view_median_um"] < 2.0
+    assert out["inter_view_median_um"] < 1.4
     assert abs(out["sphere_radius_error_um"]) < 1
     assert cli.run(["verify", str(data / "calibration" / "pose03"), "--rig", str(truth), "--json"]) == 0
     out = json.loads(capsys.readouterr().out)

@@ -23,7 +23,7 @@ class Verdict:
     words: tuple[str, ...]
     board_rms_um: float | None
     scale_error_ppm: float | None
-    inter_view_median_um: float | None
+    inter_view_median_um: float | None  #: one view's share: see `Agreement.one_view_um`
     inter_view_systematic_um: float | None
     epipolar_systematic_um: float | None  #: the largest of the views
     sphere_radius_error_um: float | None
@@ -95,7 +95,7 @@ def judge(
         (*bad, *moved, *good, *doubts),
         None if board is None else board.rms_um,
         None if board is None else board.scale_error_ppm,
-        views.median_um,
+        views.one_view_um,
         views.systematic_um,
         max((e.systematic_um for e in epipolar), default=None),
         sphere_radius_error_um,
