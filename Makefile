@@ -34,8 +34,15 @@ check: $(READY) ## lint and types; what CI runs before the tests
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: $(READY) ## time the stages against a plain copy of the same memory, all in one run
-	$(BIN)/python benchmarks/stages.py --out build/bench.json
+PEERS := build/peers/.ready
+
+$(PEERS): benchmarks/peers.txt
+	@$(PYTHON) -m venv --clear build/peers
+	@build/peers/bin/pip install --quiet --disable-pip-version-check -r benchmarks/peers.txt
+	@touch $@
+
+bench: $(READY) $(PEERS) ## time a scan against a plain copy of its memory and against other decoders (in an environment of their own)
+	$(BIN)/fringescope bench --whole --peer-python build/peers/bin/python
 
 docs: $(READY) ## the documentation as a static site in build/docs
 	$(BIN)/python tools/make_reference.py

@@ -54,6 +54,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "export": (DATA, "files know data, not algorithms"),
     "pipeline": (BOTTOM | STAGES | {"capture", "threads"}, "all ordering lives here: objects, no files"),
     "server": (ANYTHING, "the rim: nobody imports it"),
+    "bench": (ANYTHING, "times the whole, for the command line alone"),
     "warmup": (ANYTHING, "a tiny scan from end to end, for the command line alone"),
     "cli": (ANYTHING, "the rim: nobody imports it"),
     "__init__": (ANYTHING, "the front door: it re-exports the two doors of the Python API"),

@@ -7,9 +7,11 @@ from fringescope.cli.capturing import devices, import_, patterns, settings_, sim
 from fringescope.cli.responding import response
 from fringescope.cli.scanning import decode, evaluate, export, reconstruct
 from fringescope.cli.showing import demo
+from fringescope.cli.timing import bench, warmup
 
 __all__ = [
     "app",
+    "bench",
     "board",
     "calibrate",
     "decode",
@@ -26,4 +28,5 @@ __all__ = [
     "settings_",
     "simulate",
     "verify",
+    "warmup",
 ]

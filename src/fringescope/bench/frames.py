@@ -1,0 +1,55 @@
+"""Frames to time on: a gently curved surface, exact for both lenses; noise in every pixel, a fifth of them dark."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fringescope import geometry, patterns
+from fringescope.twin import presets
+from fringescope.types import AnyArray, FringeSet, PixelFormat, Rig, ViewInput, ViewPlan
+
+FULL = 5472 * 3648  #: pixels of the paper's cameras
+BAND = 128  #: rows that are drawn at a time
+
+
+def views_of(megapixels: float, count: int) -> tuple[Rig, list[ViewInput]]:
+    """The paper's rig with sensors of so many pixels (more than the real ones are finer), and `count` views' frames."""
+    scale = math.sqrt(megapixels * 1e6 / FULL)
+    rig = presets.instrument("paper", min(scale, 1.0)).rig
+    if scale > 1.0:
+        cameras = tuple(
+            type(c)(c.name, presets.scaled(c.lens, scale), c.pose) for c in presets.instrument("paper", 1.0).rig.cameras
+        )
+        rig = Rig(rig.projector, cameras, rig.volume)
+    plan = patterns.paper_plan(rig, PixelFormat.MONO8)
+    return rig, [view_of(rig, v, np.random.default_rng(i)) for i, v in enumerate(plan.views[:count])]
+
+
+def view_of(rig: Rig, plan: ViewPlan, rng: np.random.Generator) -> ViewInput:
+    """One camera's frames."""
+    lens = rig.camera(plan.camera).lens
+    frames = [np.empty((lens.height, lens.width), np.uint8) for _ in plan.keys]
+    for row in range(0, lens.height, BAND):
+        _draw(rig, plan, row, min(row + BAND, lens.height), rng, frames)
+    return ViewInput(plan, list(zip(plan.keys, frames, strict=True)))
+
+
+def _draw(rig: Rig, plan: ViewPlan, first: int, last: int, rng: np.random.Generator, frames: list[AnyArray]) -> None:
+    camera = rig.camera(plan.camera)
+    v, u = np.mgrid[first:last, : camera.lens.width].astype(float)
+    origin, ray = geometry.world_rays(camera, np.stack([u, v], axis=-1))
+    z = np.zeros_like(u)
+    for _ in range(3):  # the ray meets z(x, y) after a few steps
+        p = origin + ray * ((z - origin[2]) / ray[..., 2])[..., None]
+        z = 4.0 * np.cos(p[..., 0] / 18) * np.cos(p[..., 1] / 14)
+    at = geometry.project(rig.projector, p)
+    lit = np.hypot(u / (camera.lens.width - 1) - 0.5, v / (camera.lens.height - 1) - 0.5) < 0.505
+    for key, frame in zip(plan.keys, frames, strict=True):
+        fringes = plan.sets[key.set_index]
+        assert isinstance(fringes, FringeSet)
+        turn = (at @ np.array(fringes.cycles_per_pixel) - key.number / fringes.steps).astype(np.float32)
+        signal = np.where(lit, 90 + 60 * np.cos(np.float32(2 * np.pi) * turn), np.float32(1))
+        signal += np.float32(1.2) * rng.standard_normal(u.shape, dtype=np.float32)
+        frame[first:last] = np.clip(np.rint(signal), 0, 255)

@@ -1,0 +1,50 @@
+"""Verbs about time: bench measures it, warmup saves it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fringescope.cli.app import app
+from fringescope.cli.common import Json, Progress, emit
+
+
+@app.command()
+def bench(
+    megapixels: Annotated[float, typer.Option(help="Size of a camera's picture.")] = 20.0,
+    repeat: Annotated[int, typer.Option(help="Times that each thing is timed; the median counts.")] = 5,
+    growth: Annotated[bool, typer.Option("--growth", help="Also 0.25 to 80 megapixels (24 GB of memory).")] = False,
+    whole: Annotated[bool, typer.Option("--whole", help="Also three views to a coloured cloud and meshes.")] = False,
+    peer_python: Annotated[
+        Path | None, typer.Option(help="A Python that has other decoders (fringes), to be timed as well.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Times a scan against a plain copy of the same memory and against other decoders, all in one run."""
+    from fringescope import bench as benchmark
+
+    with Progress() as progress:
+        result = benchmark.measure(
+            megapixels, repeat, growth=growth, whole=whole, peer_python=peer_python, tell=progress.share
+        )
+    emit(result, json, benchmark.lines(result))
+
+
+@app.command()
+def warmup(json: Json = False) -> None:
+    """Compiles the kernels for this processor now, so that the first scan need not; they are kept on disk."""
+    from time import perf_counter
+
+    start = perf_counter()
+    with Progress() as progress:
+
+        def work() -> int:
+            from fringescope.warmup import compile_kernels
+
+            return compile_kernels()
+
+        points = progress.run("compiling", work)
+    seconds = perf_counter() - start
+    emit({"points": points, "seconds": seconds}, json, [f"kernels are compiled ({seconds:.1f} s)"])
