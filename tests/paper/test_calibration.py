@@ -22,7 +22,7 @@ import scipy.io
 from fringescope import calibrate, capture, evaluate, export, geometry, patterns, pipeline, store
 from fringescope.devices import simulated
 from fringescope.settings import CalibrateSettings, Settings
-from fringescope.twin import presets, scene
+from fringescope.twin import presets, scene, truth
 from fringescope.types import Board, Calibration, Rig, Scan, Sighting
 from tests.test_calibrate_solve import apart
 from tests.test_calibrate_solve import world as made_up
@@ -77,13 +77,17 @@ def measured(folder: Path, name: str, samples: int) -> Scan:
 
 
 def judged(shared: Path, name: str, samples: int, tmp_path: Path) -> dict[str, Any]:
-    """The word of the judge beside the data, which matches the world frames by the devices' poses."""
+    """A rendered scene by the rig of the rendered session, judged."""
     folder = shared / "data" / "rendered-small"
-    scan = measured(folder, name, samples)
+    rig = calibrated(folder / "calibration", samples).rig
+    return judge(shared, measured(folder, name, samples), rig, folder / "truth", name, tmp_path)
+
+
+def judge(shared: Path, scan: Scan, rig: Rig, truth: Path, name: str, tmp_path: Path) -> dict[str, Any]:
+    """The word of the judge beside the data, which matches the world frames by the devices' poses."""
     assert scan.all_points is not None
     export.write_ply(scan.all_points, tmp_path / "cloud.ply")
-    store.write_rig(tmp_path / "rig.json", calibrated(folder / "calibration", samples).rig)
-    truth = folder / "truth"
+    store.write_rig(tmp_path / "rig.json", rig)
     command = [sys.executable, shared / "tools" / "score.py", tmp_path / "cloud.ply", truth / f"{name}.json"]
     command += ["--own-rig", tmp_path / "rig.json", "--true-rig", truth / "rig.json", "--json"]
     told = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=True, timeout=300)
@@ -300,6 +304,34 @@ def remembered(seed: int) -> dict[str, Any]:
         part.write_text(json.dumps(twin_figures(seed)))
         part.replace(file)
     return dict(json.loads(file.read_text()))
+
+
+@pytest.mark.verify
+def test_twin_forms_by_the_own_rig(shared: Path, tmp_path: Path, record_property: Any) -> None:
+    """The twin at the paper's rig, an eighth of its pixels, from images alone: board, plane and spheres."""
+    seen, board, sizes, true = twin_sightings(3, 10, 0.125)
+    own = calibrate.solve(seen, board, sizes, S.calibrate).rig
+    told = {}
+    for name in ("plane", "sphere"):
+        world = simulated.World(scene.make(name, 5), presets.instrument("paper", 0.125), 6)
+        formats = dict(zip([c.name for c in true.cameras], world.instrument.pixel_formats, strict=True))
+        plan = patterns.paper_plan(own, formats)
+        images = [patterns.images(v, true.projector, S.patterns) for v in plan.views]
+        with simulated.station(world) as station:
+            views = capture.collect(station.projector, station.cameras, None, images, plan, S.capture)
+        truth.write(world.scene, true, tmp_path / name)
+        scan = pipeline.scan(views, own, S, all_points=True, surface=False)
+        (tmp_path / f"{name} by own rig").mkdir()
+        told[name] = judge(shared, scan, own, tmp_path / name, name, tmp_path / f"{name} by own rig")
+    plane, (small, large) = told["plane"], told["sphere"]["spheres"]
+    errors = large["fit_radius_error_um"], small["fit_radius_error_um"], told["sphere"]["centre_distance_error_um"]
+    record_property("form_um, std_um", (plane["form_um"], plane["std_um"]))
+    record_property("radius 12, radius 5, centres, um", errors)
+    assert plane["form_um"] <= 2
+    assert plane["std_um"] <= 6.5
+    assert abs(errors[0]) <= 3
+    assert abs(errors[1]) <= 5
+    assert abs(errors[2]) <= 3
 
 
 @pytest.mark.verify
