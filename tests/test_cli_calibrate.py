@@ -5,6 +5,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -181,6 +182,9 @@ def test_bands_of_rows_decode_to_the_same_as_the_whole(shared, monkeypatch) -> N
         np.testing.assert_array_equal(a.phase, b.phase)
         np.testing.assert_allclose(a.sigma, b.sigma, rtol=1e-6)
     assert np.isfinite(whole.directions[0].phase).sum() > 50_000
+    spooled, same = pipeline.decode_bands(replace(view, frames=store.spooled(view.frames, 1 << 40)), Settings())
+    np.testing.assert_array_equal(spooled.directions[0].phase, banded.directions[0].phase)
+    np.testing.assert_array_equal(same, mean)
 
 
 @pytest.mark.verify

@@ -720,3 +720,45 @@ def test_singular_and_not_finite_rigs(tmp_path: Path) -> None:
         (tmp_path / "a.json").write_text(json.dumps(doc))
         with pytest.raises(RigError, match=f"camera 'camera2'.*{says}"):
             store.read_rig(tmp_path / "a.json")
+
+
+# ------------------------------------------------------------------------------------------------------------- spool
+
+
+def test_a_spool_gives_frames_and_rows_as_they_came(rng):
+    from fringescope.store.spool import Spool, spooled
+    from fringescope.types import RowFrames
+
+    shapes = [(7, 5, 3), (7, 5), (7, 5), (7, 5)]
+    keys = [FrameKey(0, Role.STEP, n) for n in range(4)]
+    frames = [(k, rng.integers(0, 60000, shape, dtype=np.uint16)) for k, shape in zip(keys, shapes, strict=True)]
+    spool = Spool(iter(frames))
+    assert isinstance(spool, RowFrames)
+    for _ in range(2):
+        for (key, a), (want, b) in zip(spool, frames, strict=True):
+            assert key == want
+            np.testing.assert_array_equal(a, b)
+    for (key, a), (want, b) in zip(spool.rows(2, 5), frames, strict=True):
+        assert key == want
+        np.testing.assert_array_equal(a, b[2:5])
+    assert [a.shape[0] for _, a in spool.rows(5, 99)] == [2] * 4
+    assert spooled(frames, 1000) is frames
+    assert isinstance(spooled(frames, 1 << 30), Spool)
+
+
+def test_a_full_disk_under_the_spool_is_said(monkeypatch, rng):
+    import tempfile
+
+    from fringescope.store import spool
+
+    class Full:
+        def write(self, _data):
+            raise OSError(28, "No space left on device")
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", Full)
+    frame = rng.integers(0, 255, (7, 5), dtype=np.uint8)
+    with pytest.raises(OutputError, match="No space left on device"):
+        spool.Spool([(FrameKey(0, Role.STEP, 0), frame)])

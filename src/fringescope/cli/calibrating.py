@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fringescope import evaluate as judging
     from fringescope.calibrate import Sizes
     from fringescope.settings import Settings
-    from fringescope.store import Session
+    from fringescope.store import CaptureView, Session
     from fringescope.types import F32, U8, Board, Calibration, Evidence, Response, Rig, Sighting
 
 # ----------------------------------------------------------------------------------------------------------- calibrate
@@ -49,7 +49,7 @@ class Looked:
 
 
 def look(session: Session, s: Settings, progress: Progress, response: Response | None = None) -> Looked:
-    """Every picture of a session, one after the other, so that one view's frames are in memory.
+    """Every picture of a session, one after the other; of large ones the raw frames lie on disk, not in memory.
 
     Frames that cannot be read or decoded cost their own picture, by name.
     """
@@ -57,11 +57,16 @@ def look(session: Session, s: Settings, progress: Progress, response: Response |
 
     out = Looked(wrong=dict(session.left_out))
     plain = [(p, replace(c, views=tuple(replace(v, color=None) for v in c.views))) for p, c in session.poses]
-    inputs = [(pose, v) for pose, capture in plain for v in store.view_inputs(capture, response)]
-    for pose, view in progress.track(inputs, "looking at the boards", len(inputs)):
+    inputs = [
+        (pose, v, bytes_of(one))
+        for pose, capture in plain
+        for v, one in zip(store.view_inputs(capture, response), capture.views, strict=True)
+    ]
+    for pose, view, size in progress.track(inputs, "looking at the boards", len(inputs)):
         name = f"{pose}/{view.plan.camera}"
         try:
-            found, mean, why = pipeline.see_board(view, session.board, pose, s)
+            kept = replace(view, frames=store.spooled(view.frames, size))
+            found, mean, why = pipeline.see_board(kept, session.board, pose, s)
         except (CaptureError, DecodeError) as e:
             out.wrong[name] = str(e).removeprefix(f"{name}: ")
             continue
@@ -71,6 +76,12 @@ def look(session: Session, s: Settings, progress: Progress, response: Response |
         else:
             out.seen.append(found)
     return out
+
+
+def bytes_of(view: CaptureView) -> int:
+    """What all raw frames of a view take in memory."""
+    fmt = view.plan.pixel_format
+    return len(view.files) * view.size[0] * view.size[1] * fmt.dtype.itemsize * (3 if fmt.value == "RGB8" else 1)
 
 
 def _reduced(mean: F32) -> F32:

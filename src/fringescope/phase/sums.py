@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,13 +42,17 @@ def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
     return total
 
 
-def mean_picture(frames: Sequence[tuple[FrameKey, AnyArray]], plan: ViewPlan) -> F32:
+def mean_picture(frames: Iterable[tuple[FrameKey, AnyArray]], plan: ViewPlan) -> F32:
     """The mean (H, W) of all steps of all fringe sets, codes: the scene without fringes (all frames if none)."""
-    steps = [f for key, f in frames if key.role is Role.STEP] or [f for _, f in frames]
-    mean = np.zeros(steps[0].shape[:2], np.float32)
-    for f in steps:
-        mean += intensity(f, plan.pixel_format)
-    return np.asarray(mean / np.float32(len(steps)))
+    steps, others = [np.zeros((0, 0), np.float32)] * 2
+    n = m = 0
+    for key, frame in frames:
+        light = intensity(frame, plan.pixel_format)
+        if key.role is Role.STEP:
+            steps, n = (steps + light if n else light.astype(np.float32)), n + 1
+        elif not n:
+            others, m = (others + light if m else light.astype(np.float32)), m + 1
+    return np.asarray(steps / np.float32(n) if n else others / np.float32(max(m, 1)))
 
 
 @dataclass(frozen=True, eq=False)

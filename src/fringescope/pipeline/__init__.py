@@ -6,7 +6,7 @@ parts it is made of.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -31,6 +31,7 @@ from fringescope.types import (
     NoiseModel,
     Photo,
     Rig,
+    RowFrames,
     Scan,
     Sighting,
     Surface,
@@ -103,8 +104,8 @@ SIMPLE = 2_000_000  #: pixels that suffice to estimate the noise
 def see_board(view: ViewInput, board: Board, pose: str, s: Settings) -> tuple[Sighting | None, F32, str]:
     """One camera's frames of the board: its sighting, the mean picture (H, W) in codes, and what is wrong if None.
 
-    Raw frames are kept and decoded band by band, so that 24 frames of 20 megapixels take less than 3 GB. Raises
-    CaptureError or DecodeError for frames that do not fit.
+    Frames are decoded band by band: where `view.frames` can give rows (`RowFrames`), memory does not grow with their
+    number. Raises CaptureError or DecodeError for frames that do not fit.
     """
     decoded, mean = decode_bands(view, s)
     try:
@@ -118,19 +119,19 @@ def decode_bands(view: ViewInput, s: Settings) -> tuple[Decoded, F32]:
 
     What neighbours say of an order overlaps between the bands. The wrapped sets are not kept (`sets` is empty).
     """
-    frames = list(view.frames)
-    if not frames:
+    frames = view.frames if isinstance(view.frames, RowFrames) else list(view.frames)
+    _, first = next(iter(frames), (None, np.zeros(0)))
+    if not first.size:
         raise CaptureError(f"view '{view.plan.camera}': no frames came")
-    H, W = frames[0][1].shape[:2]
+    H, W = first.shape[:2]
     rows = max(64, BAND // W // 2 * 2)
-    noise = view.noise or (_noise_of_rows(view.plan, frames, s) if rows < H else None)  # one band tells its own
+    noise = view.noise or (_noise_of_rows(view.plan, frames, (H, W), s) if rows < H else None)  # one band tells its own
     overlap = 2 * 4 * (s.phase.order_votes // 2)
     whole: Decoded | None = None
     for row in range(0, H, rows):
         top, end = max(row - overlap, 0), min(row + rows, H)
         below = min(end + overlap, H)
-        band = [(key, np.ascontiguousarray(f[top:below])) for key, f in frames]
-        measured = measured_view(replace(view, frames=band, noise=noise), s)
+        measured = measured_view(replace(view, frames=_rows(frames, top, below), noise=noise), s)
         decoded = phase.settle_order(measured, view.plan, s.phase)
         decoded = phase.with_reasons(decoded, denoise.exposed(decoded, view.plan.pixel_format, s.denoise))
         whole = whole or phase.room_for(decoded, H)
@@ -139,9 +140,19 @@ def decode_bands(view: ViewInput, s: Settings) -> tuple[Decoded, F32]:
     return whole, phase.mean_picture(frames, view.plan)
 
 
-def _noise_of_rows(plan: ViewPlan, frames: Sequence[tuple[FrameKey, AnyArray]], s: Settings) -> NoiseModel:
-    """The noise from pairs of rows all over the picture, so that no band has its own."""
-    H, W = frames[0][1].shape[:2]
+def _rows(
+    frames: RowFrames | Sequence[tuple[FrameKey, AnyArray]], first: int, last: int
+) -> Iterable[tuple[FrameKey, AnyArray]]:
+    if isinstance(frames, RowFrames):
+        return frames.rows(first, last)
+    return [(key, np.ascontiguousarray(f[first:last])) for key, f in frames]
+
+
+def _noise_of_rows(
+    plan: ViewPlan, frames: Iterable[tuple[FrameKey, AnyArray]], shape: tuple[int, int], s: Settings
+) -> NoiseModel:
+    """The noise from pairs of rows all over the picture (H, W), so that no band has its own."""
+    H, W = shape
     pairs = np.arange(0, max(H - 1, 1), 2)
     pairs = pairs[:: max(1, H * W // SIMPLE)]
     rows = np.stack([pairs, np.minimum(pairs + 1, H - 1)], 1).ravel()

@@ -35,6 +35,7 @@ from fringescope.store.session import (
     read_observations,
     read_session,
 )
+from fringescope.store.spool import spooled
 
 __all__ = [
     "Capture",
@@ -66,6 +67,7 @@ __all__ = [
     "read_session",
     "response_document",
     "rig_document",
+    "spooled",
     "view_inputs",
     "write_capture",
     "write_decoded",

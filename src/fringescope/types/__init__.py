@@ -28,6 +28,7 @@ from fringescope.types.capture import (
     NoiseModel,
     PatternPlan,
     Role,
+    RowFrames,
     ViewInput,
     ViewPlan,
 )
@@ -90,6 +91,7 @@ __all__ = [
     "Response",
     "Rig",
     "Role",
+    "RowFrames",
     "Scan",
     "Sighting",
     "Slice",

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -143,6 +143,17 @@ class NoiseModel:
         """Variance of samples of these intensities, codes squared, same shape."""
         line = np.float32(self.a) + np.float32(self.b) * np.asarray(intensity, dtype=np.float32)
         return np.asarray(np.maximum(line, np.float32(ROUNDING)), dtype=np.float32)
+
+
+@runtime_checkable
+class RowFrames(Protocol):
+    """Frames of which some rows can be had, without the rest in memory."""
+
+    def __iter__(self) -> Iterator[tuple[FrameKey, AnyArray]]:
+        """Each frame, whole, with its key."""
+
+    def rows(self, first: int, last: int) -> Iterator[tuple[FrameKey, AnyArray]]:
+        """Rows first to last - 1 of each frame."""
 
 
 @dataclass(frozen=True, eq=False)
