@@ -12,7 +12,6 @@ import json
 import math
 import os
 import platform
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -29,6 +28,7 @@ import numpy as np
 
 from fringescope import __version__, denoise, phase, pipeline
 from fringescope.bench.frames import views_of
+from fringescope.bench.peers import median_time
 from fringescope.errors import UsageError
 from fringescope.settings import Settings
 from fringescope.types import AnyArray, FringeSet, Rig, ViewInput
@@ -136,17 +136,6 @@ def copy_floor(views: Sequence[ViewInput], repeat: int) -> float:
             list(pool.map(lambda part: np.copyto(target[part], source[part]), parts))
 
         return median_time(once, repeat)
-
-
-def median_time(once: Callable[[], object], repeat: int) -> float:
-    """Median seconds of `repeat` calls, after one that nobody counts."""
-    once()
-    times = []
-    for _ in range(repeat):
-        start = perf_counter()
-        once()
-        times.append(perf_counter() - start)
-    return statistics.median(times)
 
 
 def _one_view(rig: Rig, view: ViewInput, repeat: int, s: Settings) -> dict[str, float]:
