@@ -337,6 +337,27 @@ def order_votes(first, last, phase, voters, asked, radius, least, majority, max_
             counts[:] = 0
 
 
+@by_rows(lambda phase, *_: phase.shape[0])
+def voters(first, last, phase, sigma, most, out):
+    """The phases that may vote: finite and of a sigma below `most`; NaN elsewhere."""
+    for i in range(first, last):
+        for j in range(phase.shape[1]):
+            out[i, j] = phase[i, j] if sigma[i, j] < most else np.nan
+
+
+@by_rows(lambda reasons, *_: reasons.shape[0])
+def weigh_reasons(first, last, reasons, uncertain, bit, weak, dark, inconsistent, out):
+    """Reasons with the bit of an uncertain order, but for what is `weak`; `dark` outweighs `inconsistent`."""
+    for i in range(first, last):
+        for j in range(reasons.shape[1]):
+            r = reasons[i, j] & ~bit
+            if uncertain[i, j] and (r & weak) == 0:
+                r |= bit
+            if r & dark:
+                r &= ~inconsistent
+            out[i, j] = r
+
+
 @by_rows(lambda frame, *_: frame.shape[0])
 def gray_bit(first, last, frame, inverse, threshold, noise_codes, bit, code, contrast):
     """Read one Gray-code frame against its inverse (or a threshold image): code = 2 code + bit; -1 where uncertain.

@@ -210,23 +210,22 @@ def _check_repeats(group: Sequence[WrappedSet], bounds: F64, camera: str, s: Pha
 
 
 def vote_on_orders(decoded: Decoded, s: PhaseSettings) -> tuple[Decoded, Bool]:
-    """The neighbours' vote on the orders of a view's one direction; also where (H, W) an order has changed.
+    """The neighbours' vote on the orders of a view's one direction; also where (H, W) orders changed, (0, 0) if none did.
 
     `reasons` tells the orders that are uncertain, and may tell more. Darkness and low modulation outweigh an uncertain
     order, darkness also frames that do not fit.
     """
     d, reasons = decoded.directions[0], decoded.reasons
     uncertain = (reasons & Reason.ORDER_UNCERTAIN) != 0
+    absolute = d.phase
     if s.order_votes > 1:
-        trusted = np.isfinite(d.phase) & (d.sigma < s.max_sigma_rad)
-        absolute, uncertain = _elect(d.phase, trusted, uncertain, s)
-    else:
-        absolute = d.phase
-    moved = np.isfinite(absolute) & (absolute != d.phase)
-    out = reasons & ~np.uint16(Reason.ORDER_UNCERTAIN)
+        absolute, uncertain = _elect(d.phase, d.sigma, uncertain, s)
+    changed = absolute is not d.phase
+    moved = np.isfinite(absolute) & (absolute != d.phase) if changed else np.zeros((0, 0), np.bool_)
+    out = np.empty_like(reasons)
     weak = Reason.DARK | Reason.LOW_MODULATION | Reason.SATURATED
-    out[uncertain & ((out & weak) == 0)] |= np.uint16(Reason.ORDER_UNCERTAIN)
-    out[(out & Reason.DARK) != 0] &= ~np.uint16(Reason.INCONSISTENT)
+    bits = (np.uint16(x) for x in (Reason.ORDER_UNCERTAIN, weak, Reason.DARK, Reason.INCONSISTENT))
+    k.weigh_reasons(reasons, uncertain, *bits, out)
     return replace(decoded, directions=(replace(d, phase=absolute),), reasons=out), np.asarray(moved)
 
 
@@ -236,8 +235,7 @@ def _unwrap(
     absolute, margin = _search(group, bounds, gray, half, soft, s)
     uncertain = ~(margin >= s.order_min_margin)
     if s.order_votes > 1:
-        trusted = np.isfinite(absolute) & (group[-1].sigma < s.max_sigma_rad)
-        absolute, uncertain = _elect(absolute, trusted, uncertain, s)
+        absolute, uncertain = _elect(absolute, group[-1].sigma, uncertain, s)
     reasons = np.where(uncertain | ~np.isfinite(absolute), np.uint16(Reason.ORDER_UNCERTAIN), np.uint16(0))
     return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons.astype(np.uint16)
 
@@ -256,34 +254,36 @@ def _search(
     return absolute, margin
 
 
-def _elect(absolute: F32, trusted: Bool, uncertain: Bool, s: PhaseSettings) -> tuple[F32, Bool]:
+def _elect(absolute: F32, sigma: F32, uncertain: Bool, s: PhaseSettings) -> tuple[F32, Bool]:
     """Repair single wrong orders by the vote of the neighbours; returns the phase, and which orders stay uncertain.
 
     Three rounds among all trusted pixels change orders that a majority contradicts. In the last rounds only pixels that
     are certain vote: they confirm, or fail to confirm, the orders of the others. A region that is uncertain as a
     whole stays so.
     """
-    nan = np.float32(np.nan)
-    voters = np.where(trusted, absolute, nan)
+    voters = np.empty_like(absolute)
+    k.voters(absolute, sigma, s.max_sigma_rad, voters)
     slope = _usual_slope(voters)
     radius = s.order_votes // 2
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     least = max(3, window.size // 4)
-    changed = np.zeros(absolute.shape, np.int8)
     asked = np.empty(absolute.shape, bool)
     screens.torn_orders(voters, radius, ORDER, asked)  # where neighbours are of one mind there is nothing to ask
+    if not asked.any() and not uncertain.any():
+        return absolute, uncertain
+    changed = np.zeros(absolute.shape, np.int8)
     for _ in range(3):
         out = np.empty_like(absolute)
         k.order_votes(absolute, voters, asked, radius, least, s.order_majority, slope, out, changed)
         moved = asked & (changed != 0) & (changed >= -8) & (changed <= 8)
-        absolute, uncertain = out, uncertain & ~moved
         if not moved.any():
             break
-        voters = np.where(trusted, absolute, nan)
+        absolute, uncertain = out, uncertain & ~moved
+        k.voters(absolute, sigma, s.max_sigma_rad, voters)
         asked = cv2.dilate(moved.view(np.uint8), window).view(bool)  # elsewhere the vote would be the same again
     split = changed == -128
     for _ in range(CONFIRMATIONS):
-        sure = np.where(trusted & ~uncertain & ~split, absolute, nan)
+        sure = np.where(uncertain | split, np.float32(np.nan), voters)
         k.order_votes(absolute, sure, uncertain, radius, least, s.order_majority, slope, out, changed)
         confirmed = uncertain & (changed == 127)
         uncertain = uncertain & ~confirmed
