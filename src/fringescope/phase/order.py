@@ -210,7 +210,7 @@ def _check_repeats(group: Sequence[WrappedSet], bounds: F64, camera: str, s: Pha
 
 
 def vote_on_orders(decoded: Decoded, s: PhaseSettings) -> tuple[Decoded, Bool]:
-    """The neighbours' vote on the orders of a view's one direction; also where (H, W) orders changed, (0, 0) if none did.
+    """The neighbours' vote on the orders of a view's one direction; also where (H, W) orders changed (or (0, 0)).
 
     `reasons` tells the orders that are uncertain, and may tell more. Darkness and low modulation outweigh an uncertain
     order, darkness also frames that do not fit.
