@@ -75,6 +75,11 @@ def compare(view, rig, s=S, apart=0.0):
     top = view.plan.pixel_format.max_value
     np.testing.assert_allclose(got.background, d.background, atol=2e-6 * top)
     np.testing.assert_allclose(got.modulation, d.modulation, atol=4e-6 * top)
+    weak = ((got.reasons | g.reasons) & (Reason.DARK | Reason.LOW_MODULATION)) != 0
+    for reason in Reason:  # what a view lost, and why, does not depend on the way; orders of dark pixels mean nothing
+        counted = ~weak if reason in (Reason.ORDER_UNCERTAIN, Reason.OUT_OF_VOLUME) else np.ones_like(weak)
+        lost, expected = (int((counted & ((r & reason) != 0)).sum()) for r in (got.reasons, g.reasons))
+        assert abs(lost - expected) <= max(apart, 0.002) * good.size, reason
     return got.reasons, g.reasons
 
 

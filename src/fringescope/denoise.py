@@ -105,8 +105,8 @@ def usual_exposure(
     least share of the usual modulation of the finest of the parallel sets `family` over that of the next coarser one;
     and this usual contrast.
 
-    The latter as (8, 8) nodes that span the picture corner on corner: medians of tiles, smoothed. The share allows for
-    how much the contrast scatters anyway, as where harmonics ripple in three steps. `cut` thins.
+    The latter as (8, 8) nodes that span the picture corner on corner: medians of tiles, smoothed. With three steps the
+    share allows for how much the contrast scatters, since harmonics ripple there. `cut` thins.
     """
     fine = family[-1]
     ok = ok[cut] & (fine.saturated[cut] == 0)
@@ -130,8 +130,8 @@ def usual_exposure(
                 usual[a, b] = np.median(tile)
     contrast = np.asarray(cv2.blur(usual, (3, 3)), np.float64)
     off = np.abs(ratio / (_between(H, 8) @ contrast @ _between(W, 8).T) - 1)
-    scatter = 1.4826 * float(np.nanmedian(off))
-    return limit, min(s.min_fine_modulation, 1 - 3 * scatter), contrast
+    ripple = 1.4826 * float(np.nanmedian(off)) if min(fine.steps, coarse.steps) == 3 else 0.0
+    return limit, min(s.min_fine_modulation, 1 - 3 * ripple), contrast
 
 
 def _between(length: int, nodes: int) -> F64:

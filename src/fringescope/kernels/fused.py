@@ -199,7 +199,7 @@ def _judge(sigma, background, modulation, coarse_modulation, rough, usual, absol
         r = limits.dark if dark else 0
         r |= limits.low_modulation if low else 0
         r |= limits.inconsistent if torn else 0
-        r |= limits.outside if none else (0 if certain else limits.uncertain)
+        r |= (limits.outside if sigma[j] < _INF else 0) if none else (0 if certain else limits.uncertain)
         reasons[j] = r
 
 
