@@ -87,7 +87,7 @@ def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] |
 def _points_again(
     decoded: Decoded, moved: Bool, way: _Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
 ) -> None:
-    """Points of the pixels whose order the vote has changed: by the exact solution."""
+    """Points of the pixels whose order the vote has changed, by the same table in float64."""
     rows, columns = np.nonzero(moved)
     camera = rig.camera(decoded.camera)
     d = decoded.directions[0]
