@@ -31,7 +31,7 @@ def test_pixels_that_are_not_asked_pass_the_local_test(seed, shape, step):
     p, sigma, reasons = surface(rng, shape, step=step)
     found = calm.domains(p, sigma, reasons, FIELD, (4.0, 0.2, 4.0), calm.steps_of(p), 1.0)
     asked = np.zeros(shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, asked)
+    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
     everywhere, out = np.ones(shape, bool), reasons.copy()
     regions.mark_off_surface(
         p, sigma, found.node, found.label, found.kind, everywhere, 2, 6, 4.5, 2.5, np.uint16(2), out,
@@ -44,7 +44,7 @@ def test_pixels_that_are_not_asked_pass_the_local_test(seed, shape, step):
 def test_most_of_a_calm_surface_is_not_asked(rng):
     p, sigma, reasons = surface(rng, (200, 300), outliers=0.0, masked=0.0)
     asked = np.zeros(p.shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, asked)
+    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
     assert asked[2:-2, 2:-2].mean() < 0.05
     assert asked[:2].all()
     assert asked[:, -2:].all()
@@ -54,7 +54,7 @@ def test_a_bad_point_asks_for_all_around_it(rng):
     p, sigma, reasons = surface(rng, (40, 60), outliers=0.0, masked=0.0)
     p[20, 30] += 0.4
     asked = np.zeros(p.shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, asked)
+    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
     assert asked[18:23, 28:33].all()
 
 
@@ -64,7 +64,7 @@ def test_masked_pixels_ask_for_all_around_them(rng, hole):
     reasons[20, 2] = 4
     p[20, 2] = hole
     asked = np.zeros(p.shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, asked)
+    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
     assert (asked | (reasons != 0))[18:23, :5].all()
     assert not asked[20, 2]
     assert asked[2:-2, 10:-2].mean() < 0.05

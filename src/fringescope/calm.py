@@ -38,10 +38,10 @@ def steps_of(phase: F32) -> F32:
     return out
 
 
-def cover_of(reasons: U16) -> U8:
-    """MIXED, WHOLE or VOID of each tile (h, w)."""
+def cover_of(reasons: U16, bits: int = 0xFFFF) -> U8:
+    """MIXED, WHOLE or VOID of each tile (h, w), as to the reasons `bits`."""
     out = np.empty(shape_of(reasons.shape), np.uint8)
-    tiles.cover(reasons, out)
+    tiles.cover(reasons, np.uint16(bits), out)
     return out
 
 

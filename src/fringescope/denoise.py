@@ -33,7 +33,7 @@ from fringescope.types import (
     WrappedSet,
 )
 
-NEAR = 3.5  #: sigmas; pixels that lie, as all around them, nearer to the local surface need no slower look
+NEAR, WIDE = 3.5, 4.6  #: sigmas; pixels that lie nearer to the local surface, and all around them, need no slower look
 TELLING = 0.5  #: least share of the best direction's sensitivity to depth that a direction needs to be judged by
 
 
@@ -256,8 +256,8 @@ def _rough(d: Direction, reasons: U16, field: F64, s: DenoiseSettings) -> Bool:
     """The pixels that have to be judged: those that a quick look does not find calm, if the window is the usual one."""
     asked = memory.empty(reasons.shape, np.bool_)
     if int(s.local_window) == 5:
-        limit = min(NEAR, 0.75 * s.local_sigma)
-        screens.rough_pixels(d.phase, d.sigma, reasons, _least_step(field, s), limit, asked)
+        limits = min(NEAR, 0.75 * s.local_sigma), min(WIDE, s.local_sigma, 1.8 * s.local_roughness)
+        screens.rough_pixels(d.phase, d.sigma, reasons, _least_step(field, s), *limits, asked)
     else:
         asked[:] = True
     return asked

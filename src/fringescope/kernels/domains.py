@@ -12,18 +12,21 @@ from fringescope.kernels.tiles import TILE
 
 PIXELS, CALM, VOID = 0, 1, 2
 
+_REST = TILE - 1
+_BITS = _REST.bit_length()
+
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _node_of(node, kind, i, j):
-    t, u = i // TILE, j // TILE
-    return node[t, u] + (0 if kind[t, u] != PIXELS else (i - t * TILE) * TILE + (j - u * TILE))
+    t, u = i >> _BITS, j >> _BITS
+    return node[t, u] + (0 if kind[t, u] != PIXELS else ((i & _REST) << _BITS) + (j & _REST))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
 def label_of(node, label, kind, i, j):
     """The domain of a pixel; -1 where it is masked."""
-    t, u = i // TILE, j // TILE
-    return label[node[t, u] + (0 if kind[t, u] != PIXELS else (i - t * TILE) * TILE + (j - u * TILE))]
+    t, u = i >> _BITS, j >> _BITS
+    return label[node[t, u] + (0 if kind[t, u] != PIXELS else ((i & _REST) << _BITS) + (j & _REST))]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

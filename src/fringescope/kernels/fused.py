@@ -28,6 +28,7 @@ _NAN = np.float32(np.nan)
 _P, _Q, _S = BLOCK, 2 * BLOCK, 3 * BLOCK  # where the sums of I cos, I sin and I^2 lie in their scratch
 _CONTRACT = {"contract"}
 _FAR = np.int32(1 << 30)
+_HALF_ROOT = np.float32(math.sqrt(0.5))
 _PER_TURN2 = np.float32(1.0 / (4.0 * math.pi**2))
 
 
@@ -39,6 +40,7 @@ class Sets(NamedTuple):
     sin: np.ndarray
     ratio: np.ndarray  #: (K,) float32, frequency over that of the set before; of the first: 1
     frequency: np.ndarray  #: (K,) float64
+    plain: np.ndarray  #: (K,) bool: the sine counts forward
     top: int  #: code of a saturated sample
     pivot: np.float32  #: taken off every sample, so that sums of squares keep their digits
 
@@ -69,7 +71,10 @@ class Limits(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def _sums(x, first, last, cos, sin, pivot, n, acc):
-    """Sums of I, I cos, I sin and I^2 of frames first..last-1 of a block `x` (F, BLOCK) into `acc` (4 BLOCK,)."""
+    """Sums of I, I cos, I sin and squared residuals of frames first..last-1 of a block `x` (F, BLOCK), into `acc`.
+
+    Samples count from `pivot` on.
+    """
     for j in range(n):
         acc[j] = _ZERO
         acc[_P + j] = _ZERO
@@ -97,6 +102,45 @@ def _sums(x, first, last, cos, sin, pivot, n, acc):
             acc[_Q + j] += a * sa
             acc[_S + j] += a * a
         f += 1
+    mean, gain = _ONE / _f(last - first), _TWO / _f(last - first)
+    for j in range(n):
+        t, p, q = acc[j], acc[_P + j], acc[_Q + j]
+        acc[_S + j] = left_over(acc[_S + j], t, p, q, t * mean, p * gain, q * gain, _ONE)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _four(x, first, n, acc):
+    """As `_sums` for four steps, by differences: no sum of squares, but that of the residuals, which is one square."""
+    xa, xb, xc, xd = x[first], x[first + 1], x[first + 2], x[first + 3]
+    total, in_phase, quadrature, rest = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
+    for j in range(n):
+        a, b, c, d = _f(xa[j]), _f(xb[j]), _f(xc[j]), _f(xd[j])
+        even, odd = a + c, b + d
+        total[j] = even + odd
+        in_phase[j] = a - c
+        quadrature[j] = b - d
+        off = even - odd
+        rest[j] = _f(0.25) * off * off
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _eight(x, first, n, acc):
+    """As `_four`, for eight steps: the residuals are the second, third and fourth harmonics of the samples."""
+    x0, x1, x2, x3 = x[first], x[first + 1], x[first + 2], x[first + 3]
+    x4, x5, x6, x7 = x[first + 4], x[first + 5], x[first + 6], x[first + 7]
+    total, in_phase, quadrature, rest = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
+    for j in range(n):
+        a, b, c, d = _f(x0[j]), _f(x1[j]), _f(x2[j]), _f(x3[j])
+        e, f, g, h = _f(x4[j]), _f(x5[j]), _f(x6[j]), _f(x7[j])
+        s0, s1, s2, s3 = a + e, b + f, c + g, d + h
+        d0, d1, d2, d3 = a - e, b - f, c - g, d - h
+        even, odd = s0 + s2, s1 + s3
+        u, v = _HALF_ROOT * (d1 - d3), _HALF_ROOT * (d1 + d3)
+        total[j] = even + odd
+        in_phase[j] = d0 + u
+        quadrature[j] = d2 + v
+        c2, q2, c3, q3, c4 = s0 - s2, s1 - s3, d0 - u, v - d2, even - odd
+        rest[j] = _f(0.25) * ((c2 * c2 + q2 * q2) + (c3 * c3 + q3 * q3)) + _f(0.125) * c4 * c4
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -107,12 +151,12 @@ def _fit(acc, steps, noise_a, noise_b, misfit2, pivot, n, phase, variance, backg
     """
     mean, gain = _ONE / _f(steps), _TWO / _f(steps)
     share = _ONE / _f(steps - 3) if steps > 3 else _ZERO
-    total, in_phase, quadrature, squares = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
+    total, in_phase, quadrature, residuals = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
     for j in range(n):
         t, p, q = total[j], in_phase[j], quadrature[j]
         a, c, s = t * mean, p * gain, q * gain
         b = math.sqrt(c * c + s * s)
-        rest = left_over(squares[j], t, p, q, a, c, s, share)
+        rest = residuals[j] * share
         a += pivot
         v = noise_a + noise_b * a
         v = v if v > _f(ROUNDING) else _f(ROUNDING)
@@ -379,15 +423,29 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
                 target = x[f]
                 for j in range(n):
                     top[j] = max(top[j], target[j])
+            brightest = top[0]
+            for j in range(n):
+                brightest = max(brightest, top[j])
             for k in range(K):
                 a, b = sets.start[k], sets.start[k + 1]
-                _sums(x, a, b, sets.cos, sets.sin, sets.pivot, n, acc)
-                _fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, sets.pivot, n, wrapped[k], own[k], back,
+                pivot = sets.pivot
+                if b - a == 4 and sets.plain[k]:
+                    _four(x, a, n, acc)
+                    pivot = _ZERO
+                elif b - a == 8 and sets.plain[k]:
+                    _eight(x, a, n, acc)
+                    pivot = _ZERO
+                else:
+                    _sums(x, a, b, sets.cos, sets.sin, pivot, n, acc)
+                _fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k], back,
                      mod[k], rough)  # fmt: skip
-            for m in range(4):
+            for m in range(2):
                 _ramp(limit_row[m], limit_scale, col, n, limit[m])
             _ramp(usual_row, usual_scale, col, n, around)
             low, high = _candidates(wrapped[0], limit[0], limit[1], per_turn, slack, n)
+            if low != high or brightest >= sets.top:
+                for m in range(2, 4):
+                    _ramp(limit_row[m], limit_scale, col, n, limit[m])
             if low != high:
                 for j in range(n):
                     best[j] = _NAN
@@ -405,18 +463,25 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
                 _margin(best_chi2, second, best_margin2, n, margin2)
             b = mod[K - 1]
             _judge(own[K - 1], back, b, mod[max(K - 2, 0)], rough, around, best, margin2, limits, n, fine, bits)
-            for j in range(n):
+            for j in range(n if brightest >= sets.top else 0):
                 if top[j] >= sets.top:
                     bits[j], best[j], fine[j], back[j], b[j] = _clipped_pixel(
                         x, j, sets, limits, limit, one[0], one[1], one[2], one[3], used
                     )
-            points(best, fine, row, depths, col, n, X, Y, Z, sigma_mm[i, col : col + n])
-            mark_outside(X, Y, Z, depths, n, bits, limits.outside, limits.uncertain)
-            point = xyz[i, col : col + n]
+            lost = ~limits.uncertain
             for j in range(n):
-                point[j, 0] = X[j]
-                point[j, 1] = Y[j]
-                point[j, 2] = Z[j]
+                lost = lost if bits[j] & ~limits.uncertain else np.uint16(0)
+            point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
+            if lost != 0:
+                for j in range(n):
+                    along[j] = point[j, 0] = point[j, 1] = point[j, 2] = _NAN
+            else:
+                points(best, fine, row, depths, col, n, X, Y, Z, along)
+                mark_outside(X, Y, Z, depths, n, bits, limits.outside, limits.uncertain)
+                for j in range(n):
+                    point[j, 0] = X[j]
+                    point[j, 1] = Y[j]
+                    point[j, 2] = Z[j]
             out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
             out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
             for j in range(n):

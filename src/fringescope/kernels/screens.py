@@ -1,6 +1,6 @@
 """Quick looks before slow ones: which pixels a mask has to judge at all. Most surfaces are calm almost everywhere.
 
-Each screen passes a pixel only where the slow kernel of `regions.py` or `fringes.py` could not reject or change it; it
+Each screen passes a pixel only where the slow kernel of `regions.py` would not reject it (with sigmas that neighbours share but for a factor of two or three); it
 asks for all others (True). In float32, in loops that compilers turn into vector instructions; arrays and scalars only.
 """
 
@@ -101,11 +101,11 @@ def _some(row):
 
 
 @by_rows(lambda phase, *_: phase.shape[0])
-def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
+def rough_pixels(first, last, phase, sigma, reasons, step, limit, wide_limit, ask):
     """Pixels that `regions.local_surface` (5 x 5) must judge: True in `ask` (H, W).
 
-    The others are masked; or they lie, like their 24 neighbours, within `limit` sigmas of the quadric through these,
-    none of the 25 is masked, and no step between neighbours reaches `step` radians: they are one domain.
+    The others are masked; or they lie within `limit` sigmas of the quadric through their 24 neighbours, these within
+    `wide_limit`, none of the 25 is masked, and no step between neighbours reaches `step` radians: they are one domain.
     """
     H, W = phase.shape
     m = BLOCK + 4
@@ -113,7 +113,7 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
     c0, c1, c2 = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     c3, c4, c5 = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     off, most, mask = np.empty(BLOCK, np.float32), np.empty(m, np.float32), np.empty(m, np.uint16)
-    limit2, step = _f(limit) * _f(limit), _f(step)
+    limit2, wide2, step = _f(limit) * _f(limit), _f(wide_limit) * _f(wide_limit), _f(step)
     for i in range(first, last):
         if i < 2 or i >= H - 2 or W < 5:
             for j in range(W):
@@ -124,6 +124,12 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
             ask[i, W - 1 - j] = reasons[i, W - 1 - j] == 0
         for col in range(2, W - 2, BLOCK):
             n = min(BLOCK, W - 2 - col)
+            void = True
+            for j in range(col, col + n):
+                void &= reasons[i, j] != 0
+            if void:
+                ask[i, col : col + n] = False
+                continue
             left, right = col - 2, col + n + 2
             wide = n + 4
             centre = phase[i, left:right]
@@ -137,7 +143,7 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
                 off[j] = c0[j] * c0[j] - limit2 * (sigma[i, col + j] * sigma[i, col + j])
             for y in range(-2, 3):
                 _off_quadric(
-                    phase[i + y, left:right], sigma[i + y, left:right], centre, _f(y), limit2, n,
+                    phase[i + y, left:right], sigma[i + y, left:right], centre, _f(y), wide2, n,
                     c0, c1, c2, c3, c4, c5, off,
                 )  # fmt: skip
             for j in range(wide):

@@ -44,7 +44,9 @@ def elect(phase: F32, sigma: F32, reasons: U16, s: PhaseSettings) -> tuple[IntAr
     trusted = (phase, sigma, np.float32(s.max_sigma_rad))
     rules = (radius, least, s.order_majority, _usual_slope(*trusted))
     one_mind = 2 * radius * calm.rise(calm.steps_of(phase)) < calm.SAFE * ORDER
-    looked = watched = calm.widened(~one_mind, 4 * radius) | (calm.cover_of(reasons) != calm.WHOLE)
+    doubtful = calm.widened(~one_mind, 4 * radius) | (calm.cover_of(reasons) != calm.WHOLE)
+    matters = calm.widened(calm.cover_of(reasons, _WEAK) != calm.VOID, 7 * radius)  # as far as all rounds carry a vote
+    looked = watched = doubtful & matters
     asked, changed = memory.empty(phase.shape, np.uint8), memory.empty(phase.shape, np.int8)
     some = np.empty(looked.shape, np.bool_)
     k.torn(*trusted, reasons, _WEAK, radius, ORDER, looked, asked, changed, some)

@@ -135,6 +135,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
         (signs * np.sin(angles)).astype(f4),
         np.append(1.0, frequency[1:] / frequency[:-1]).astype(f4),
         frequency,
+        np.array([np.dot(h, g) > 0 for _, h in family]),
         fmt.max_value,
         f4(pivot),
     )
