@@ -319,7 +319,7 @@ def test_order_votes_equal_their_twin(seed):
     votes.poll(p, np.full_like(sigma, 0.1), 0.5, barred, asked, looked, 2, 6, 0.7, 0.9, again)
     np.testing.assert_array_equal(again, want_changed)
     reasons = np.full(p.shape, 9, np.uint16)
-    votes.move(changed, asked, looked, np.uint16(8), p, reasons, moved, some)
+    votes.move(changed, asked, looked, np.uint16(8), np.uint8(1), p, reasons, moved, some)
     np.testing.assert_allclose(p, want, atol=1e-4)
     turned = (changed != 0) & (np.abs(changed.astype(int)) <= 8)
     np.testing.assert_array_equal(moved != 0, turned)
@@ -382,7 +382,9 @@ def test_domains_equal_scipy_components(seed):
     factor, floor, noise = 2.5, 0.2, 2.0
     limit = np.maximum(factor * slow.spread(field, p.shape)[..., 2], floor), noise
     out = reasons.copy()
-    regions.mark_loose(p, sigma, reasons, np.ones((2, 3), bool), field, factor, floor, noise, 5, np.uint16(4), out)
+    every, pending = np.ones((2, 3), bool), np.uint16(32)
+    regions.mark_loose(p, sigma, out, every, field, factor, floor, noise, 5, pending)
+    regions.confirm(out, every, pending, np.uint16(4))
     np.testing.assert_array_equal(out == 4, slow.loose_pixels(p, sigma, reasons, limit, 5))
     same_domains(p, sigma, reasons, field, (factor, floor, noise), limit)
 

@@ -61,7 +61,7 @@ def compare(view, rig, s=S, apart=0.0):
     """Fused and staged agree: the same pixels (but for a share `apart`), points to 0.2 um, the rest to float32."""
     fused = fast.decode(view, rig, s)
     assert fused is not None
-    got, xyz, sigma_mm = fused
+    got, xyz, sigma_mm, _ = fused
     d, g = by_stages(view, rig, s)
     good, want = got.reasons == 0, g.reasons == 0
     assert (good != want).mean() <= apart
@@ -155,8 +155,8 @@ def test_wrong_orders_are_repaired_and_their_points_with_them():
     rig = rig_of()
     view = view_of(rig, rig.cameras[1], PixelFormat.MONO8, (270.0, 16.0), (3, 8), B=0.03, A=0.5)
     s = replace(S, phase=PhaseSettings(order_min_margin=1.5), denoise=replace(S.denoise, max_sigma_rad=1.0))
-    got, xyz, sigma_mm = fast.decode(view, rig, s)
-    alone, _, _ = fast.decode(view, rig, replace(s, phase=replace(s.phase, order_votes=1)))
+    got, xyz, sigma_mm, _ = fast.decode(view, rig, s)
+    alone, *_ = fast.decode(view, rig, replace(s, phase=replace(s.phase, order_votes=1)))
     moved = np.abs(got.directions[0].phase - alone.directions[0].phase) > 1
     assert moved.sum() > 20
     _, g = by_stages(view, rig, s)

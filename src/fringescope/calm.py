@@ -21,7 +21,7 @@ from fringescope.threads import WORKERS, in_bands
 from fringescope.types import F32, F64, U8, U16, AnyArray, Bool
 
 __all__ = ["MIXED", "VOID", "WHOLE", "Domains", "copy_of", "cover_of", "domains", "growing", "linked", "rise",
-           "steps_of", "widened"]  # fmt: skip
+           "steps_of", "tally", "update_steps", "widened"]  # fmt: skip
 
 SAFE = 0.999  #: of a limit, so that rounding decides nothing
 
@@ -32,10 +32,15 @@ def shape_of(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def steps_of(phase: F32) -> F32:
-    """Least and greatest step to the next pixel in the row and in the column, of each tile (4, h, w)."""
-    out = np.empty((4, *shape_of(phase.shape)), np.float32)
-    tiles.steps(phase, out)
+    """Least and greatest step to the next pixel in row and column, and phase, of each tile (6, h, w)."""
+    out = np.empty((6, *shape_of(phase.shape)), np.float32)
+    tiles.steps(phase, np.ones(out.shape[1:], np.bool_), out)
     return out
+
+
+def update_steps(phase: F32, some: Bool, steps: F32) -> None:
+    """Measure the steps of `some` tiles (h, w) anew, in place."""
+    tiles.steps(phase, some, steps)
 
 
 def cover_of(reasons: U16, bits: int = 0xFFFF) -> U8:
@@ -43,6 +48,15 @@ def cover_of(reasons: U16, bits: int = 0xFFFF) -> U8:
     out = np.empty(shape_of(reasons.shape), np.uint8)
     tiles.cover(reasons, np.uint16(bits), out)
     return out
+
+
+def tally(codes: U16) -> NDArray[np.int64]:
+    """How often each code comes: (65536,)."""
+    bands = 4 * WORKERS
+    rows = -(-len(codes) // bands)
+    parts = np.zeros((bands, 1 << 16), np.int64)
+    in_bands(len(codes), rows, lambda first, last: tiles.tally(first, last, codes, parts[first // rows]))
+    return np.asarray(parts.sum(axis=0))
 
 
 def copy_of(reasons: U16) -> U16:
@@ -79,29 +93,12 @@ def linked(steps: F32, cover: U8, limit: float, around: int = 0) -> Bool:
 def growing(steps: F32, cover: U8, field: F64, shape: tuple[int, int], reach: int) -> Bool:
     """Tiles (h, w) from whose pixels the phase cannot fall over `reach` pixels along the unit direction in `field`.
 
-    `field` (h', w', 3) spans the image of `shape` corner on corner; the direction is rounded to pixels, hence +-1.
+    `field` (h', w', 3) spans the image of `shape` corner on corner.
     """
     whole = cv2.erode((cover == WHOLE).astype(np.uint8), _window(reach + 1)) > 0
-    window = _window(reach + 1)
-    low = [cv2.erode(steps[n], window) for n in (0, 2)]
-    high = [cv2.dilate(steps[n], window) for n in (1, 3)]
-    h, w = cover.shape
-    at = [(TILE * (np.arange(n) + 0.5) - 0.5).clip(0, side - 1) for n, side in ((h, shape[0]), (w, shape[1]))]
-    rows, columns = (_weights(x, side, nodes) for x, side, nodes in zip(at, shape, field.shape[:2], strict=True))
-    growth = np.zeros((h, w), np.float32)
-    size = np.hypot(field[..., 0], field[..., 1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        for axis in range(2):
-            along = (rows @ (field[..., axis] / size) @ columns.T * reach).astype(np.float32)
-            ends = [np.minimum(a * low[axis], a * high[axis]) for a in (along - 1, along + 1)]
-            growth += np.minimum(*ends)
-        return np.asarray(whole & (growth >= 0))
-
-
-def _weights(at: F64, side: int, nodes: int) -> F64:
-    """Weights (n, nodes) of linear interpolation at pixels `at` between nodes that span a side end to end."""
-    place = at * (nodes - 1) / max(side - 1, 1)
-    return np.asarray(np.clip(1.0 - np.abs(place[:, None] - np.arange(nodes)), 0.0, None))
+    out = np.empty(cover.shape, np.bool_)
+    tiles.growing(steps, whole, field, *shape, reach, out)
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,15 +34,16 @@ from fringescope.types import (
 )
 
 NEAR, WIDE = 3.5, 4.6  #: sigmas; pixels that lie nearer to the local surface, and all around them, need no slower look
+_PENDING = np.uint16(1 << 15)  #: no reason: a mark that a mask leaves and clears
 TELLING = 0.5  #: least share of the best direction's sensitivity to depth that a direction needs to be judged by
 
 
 class Tiles:
     """How much the phase of each direction of a view steps within each tile of pixels; measured when first asked."""
 
-    def __init__(self, decoded: Decoded) -> None:
+    def __init__(self, decoded: Decoded, steps: Sequence[F32] = ()) -> None:
         self._decoded = decoded
-        self._steps: dict[int, F32] = {}
+        self._steps = dict(enumerate(steps))
 
     def steps(self, d: Direction) -> F32:
         """See `calm.steps_of`; `d` must be one of the view's."""
@@ -155,13 +156,15 @@ def _between(length: int, nodes: int) -> F64:
     return np.asarray(np.clip(1.0 - np.abs(at[:, None] - np.arange(nodes)), 0.0, None))
 
 
-def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings, tiles: Tiles | None = None) -> U16:
+def monotonic(
+    decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings, tiles: Tiles | None = None, *, in_place: bool = False
+) -> U16:
     """III-D 2: fringes that run backwards come mirrored, from the substrate (equation 17).
 
     On every surface that faces camera and projector the phase grows along the image of the projector's rays in one
     sense, which the rig predicts at each pixel. Neighbours vote, so that noise on flat phase marks nothing.
     """
-    out = calm.copy_of(reasons)
+    out = reasons if in_place else calm.copy_of(reasons)
     H, W = decoded.shape
     reach = max(1, round(s.monotonic_reach * W / 684))
     radius = int(s.monotonic_window) // 2
@@ -198,34 +201,36 @@ def telling(decoded: Decoded, rig: Rig | None) -> tuple[Direction, ...]:
 
 
 def connected(
-    decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings, tiles: Tiles | None = None
-) -> U16:
+    decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings, tiles: Tiles | None = None, *,
+    in_place: bool = False,
+) -> U16:  # fmt: skip
     """III-D 3: neighbours whose phases differ by less than T1 form domains; domains of fewer than T2 pixels go.
 
     Pixels that continue too few of their neighbours stand on a jump and go first.
     """
-    out = calm.copy_of(reasons)
+    out = reasons if in_place else calm.copy_of(reasons)
     tiles = tiles or Tiles(decoded)
     for d in telling(decoded, rig):
-        field = _slopes(d, reasons, decoded, rig)
+        field = _slopes(d, out, decoded, rig)
         cover = calm.cover_of(out)
         asked = ~calm.linked(tiles.steps(d), cover, _least_step(field, s), around=1) & (cover != calm.VOID)
         if asked.any():
-            before = calm.copy_of(out)
             k.mark_loose(
-                d.phase, d.sigma, before, asked, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma,
-                int(s.jump_links), np.uint16(Reason.JUMP), out,
+                d.phase, d.sigma, out, asked, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, int(s.jump_links),
+                _PENDING,
             )  # fmt: skip
+            k.confirm(out, asked, _PENDING, np.uint16(Reason.JUMP))
         found = _domains(d, out, field, s, tiles)
         found.mark_small(s.island_share * decoded.background.size, np.uint16(Reason.ISLAND), out)
     return out
 
 
 def local(
-    decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings, tiles: Tiles | None = None
-) -> U16:
+    decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings, tiles: Tiles | None = None, *,
+    in_place: bool = False,
+) -> U16:  # fmt: skip
     """The fourth test: a point's phase lies within some of its own sigmas of the surface of its neighbours."""
-    out = calm.copy_of(reasons)
+    out = reasons if in_place else calm.copy_of(reasons)
     tiles = tiles or Tiles(decoded)
     for d in telling(decoded, rig):
         for _ in range(int(s.local_rounds)):
@@ -334,17 +339,23 @@ def _second_difference(m: F32, k: int) -> float:
 def verdict(grid: Grid, alike: bool = False) -> ViewVerdict:
     """What a view lost and why, in figures and in words that a person can act on; `alike` is that of `interpolated`."""
     n = int(grid.reasons.size)
-    lost = {r.name.lower(): int(((grid.reasons & r) != 0).sum()) for r in Reason if r.name}
-    points = int((grid.reasons == 0).sum())
-    without = (grid.reasons & (Reason.DARK | Reason.LOW_MODULATION)) != 0
-    lit = n - int(without.sum())
+    count = calm.tally(grid.reasons)
+    codes = np.flatnonzero(count)
+    count = count[codes]
+
+    def of(bits: int, without: int = 0) -> int:
+        return int(count[((codes & bits) != 0) & ((codes & without) == 0)].sum())
+
+    lost = {r.name.lower(): of(r) for r in Reason if r.name}
+    points = int(count[codes == 0].sum())
+    unlit = int(Reason.DARK | Reason.LOW_MODULATION)
+    lit = n - of(unlit)
     words = [f"{grid.camera}: {points} points on {lit} pixels with fringes of {n}"]
     if not points:
         words.append(f"{grid.camera}: no point was left")
     for reason, share, advice in _ADVICE:
-        hit = (grid.reasons & reason) != 0
         weak = reason in (Reason.DARK, Reason.LOW_MODULATION)
-        part = float(hit.sum()) / n if weak else float((hit & ~without).sum()) / max(lit, 1)
+        part = of(reason) / n if weak else of(reason, unlit) / max(lit, 1)
         if part > share:
             base = "all pixels" if weak else "the pixels with fringes"
             words.append(f"{grid.camera}: {100 * part:.1f} % of {base}: {reason.label}; {advice}")

@@ -26,7 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fringescope import __version__, denoise, phase, pipeline
+from fringescope import __version__, denoise, memory, phase, pipeline
 from fringescope.bench.frames import views_of
 from fringescope.bench.peers import median_time
 from fringescope.errors import UsageError
@@ -157,6 +157,7 @@ def _one_view(rig: Rig, view: ViewInput, repeat: int, s: Settings) -> dict[str, 
 def _memory(rig: Rig, view: ViewInput, s: Settings) -> tuple[int, int]:
     """Bytes of input and output of a view, and the most that was held while it was made, input included."""
     given = sum(frame.nbytes for _, frame in view.frames)
+    memory.release()
     tracemalloc.start()
     try:
         decoded, grid = pipeline.scan_view(view, rig, s)

@@ -8,23 +8,31 @@ import numpy as np
 
 from fringescope import geometry, patterns
 from fringescope.twin import presets
-from fringescope.types import AnyArray, FringeSet, PixelFormat, Rig, ViewInput, ViewPlan
+from fringescope.types import AnyArray, Camera, FringeSet, Lens, PixelFormat, Rig, ViewInput, ViewPlan
 
 FULL = 5472 * 3648  #: pixels of the paper's cameras
+ZOOM = 1.3  #: focal length over the paper's
 BAND = 128  #: rows that are drawn at a time
 
 
 def views_of(megapixels: float, count: int) -> tuple[Rig, list[ViewInput]]:
-    """The paper's rig with sensors of so many pixels (more than the real ones are finer), and `count` views' frames."""
+    """The paper's rig with sensors of so many pixels (more than the real ones are finer), and `count` views' frames.
+
+    The lenses are a little longer than the paper's, so that fringes cover the pictures.
+    """
     scale = math.sqrt(megapixels * 1e6 / FULL)
     rig = presets.instrument("paper", min(scale, 1.0)).rig
-    if scale > 1.0:
-        cameras = tuple(
-            type(c)(c.name, presets.scaled(c.lens, scale), c.pose) for c in presets.instrument("paper", 1.0).rig.cameras
-        )
-        rig = Rig(rig.projector, cameras, rig.volume)
+    rig = Rig(rig.projector, tuple(_zoomed(c, max(scale, 1.0)) for c in rig.cameras), rig.volume)
     plan = patterns.paper_plan(rig, PixelFormat.MONO8)
     return rig, [view_of(rig, v, np.random.default_rng(i)) for i, v in enumerate(plan.views[:count])]
+
+
+def _zoomed(camera: Camera, scale: float) -> Camera:
+    lens = presets.scaled(camera.lens, scale) if scale > 1.0 else camera.lens
+    K = lens.K.copy()
+    K[0, 0] *= ZOOM
+    K[1, 1] *= ZOOM
+    return Camera(camera.name, Lens(lens.width, lens.height, K, lens.distortion), camera.pose)
 
 
 def view_of(rig: Rig, plan: ViewPlan, rng: np.random.Generator) -> ViewInput:

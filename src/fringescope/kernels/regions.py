@@ -73,21 +73,23 @@ def mark_backward(first, last, signs, asked, radius, share, least, bit, reasons)
 
 
 @by_rows(lambda _phase, _sigma, _reasons, asked, *_: asked.shape[0])
-def mark_loose(first, last, phase, sigma, reasons, asked, field, factor, floor, noise, least, bit, out):
-    """Give `bit` in `out`, a copy of `reasons`, to pixels that stand on a jump: they continue the surface of fewer than
-    `least` of their eight neighbours. Only in the tiles that are `asked`.
+def mark_loose(first, last, phase, sigma, reasons, asked, field, factor, floor, noise, least, pending):
+    """Give `pending` to pixels that stand on a jump: they continue the surface of fewer than `least` of their eight
+    neighbours. Only in the tiles that are `asked`; `confirm` turns the pending bit, which counts for no reason yet,
+    into another.
 
     At the image border the same share of those inside counts. The eight at distance two may stand in for the next
     ones: on a Bayer sensor these are of the pixel's own colour, and often the only ones with enough light.
     """
     H, W = phase.shape
+    others = ~pending
     for t in range(first, last):
         for u in range(asked.shape[1]):
             if not asked[t, u]:
                 continue
             for i in range(t * TILE, min(t * TILE + TILE, H)):
                 for j in range(u * TILE, min(u * TILE + TILE, W)):
-                    if reasons[i, j] != 0:
+                    if reasons[i, j] & others != 0:
                         continue
                     step = largest_step(field, factor, floor, i, j, H, W)
                     loose = True
@@ -99,13 +101,27 @@ def mark_loose(first, last, phase, sigma, reasons, asked, field, factor, floor, 
                                 if (dy == 0 and dx == 0) or not (0 <= y < H and 0 <= x < W):
                                     continue
                                 inside += 1
-                                if reasons[y, x] == 0 and linked(phase, sigma, step, noise, i, j, y, x):
+                                if reasons[y, x] & others == 0 and linked(phase, sigma, step, noise, i, j, y, x):
                                     links += 1
                         loose = loose and 8 * links < least * inside
                         if not loose:
                             break
                     if loose:
-                        out[i, j] = bit
+                        reasons[i, j] |= pending
+
+
+@by_rows(lambda _reasons, asked, *_: asked.shape[0])
+def confirm(first, last, reasons, asked, pending, bit):
+    """Turn the bit `pending` into `bit`, in the tiles that are `asked`."""
+    H, W = reasons.shape
+    for t in range(first, last):
+        for u in range(asked.shape[1]):
+            if not asked[t, u]:
+                continue
+            for i in range(t * TILE, min(t * TILE + TILE, H)):
+                for j in range(u * TILE, min(u * TILE + TILE, W)):
+                    if reasons[i, j] & pending:
+                        reasons[i, j] = (reasons[i, j] & ~pending) | bit
 
 
 @njit(cache=True, error_model="numpy")

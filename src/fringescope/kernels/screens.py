@@ -1,7 +1,8 @@
 """Quick looks before slow ones: which pixels a mask has to judge at all. Most surfaces are calm almost everywhere.
 
-Each screen passes a pixel only where the slow kernel of `regions.py` would not reject it (with sigmas that neighbours share but for a factor of two or three); it
-asks for all others (True). In float32, in loops that compilers turn into vector instructions; arrays and scalars only.
+Each screen passes a pixel only where the slow kernel of `regions.py` would not reject it, if the sigmas of neighbours
+are alike but for a factor of two or three; it asks for all others (True). In float32, in loops that compilers turn
+into vector instructions; arrays and scalars only.
 """
 
 import numpy as np

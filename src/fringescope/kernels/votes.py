@@ -102,9 +102,9 @@ def torn(first, last, phase, sigma, most, reasons, weak, radius, range_, looked,
             u = max(end, u + 1)
 
 
-@by_rows(lambda _moved, _radius, looked, _asked: looked.shape[0])
-def near(first, last, moved, radius, looked, asked):
-    """Pixels within `radius` of one that has `moved`: 1 in `asked` (H, W); there the vote may come out otherwise."""
+@by_rows(lambda _moved, _mark, _radius, looked, _asked: looked.shape[0])
+def near(first, last, moved, mark, radius, looked, asked):
+    """Pixels within `radius` of one whose `moved` has `mark`: 1 in `asked` (H, W); others' votes stay as they were."""
     H, W = moved.shape
     for t in range(first, last):
         for u in range(looked.shape[1]):
@@ -115,8 +115,8 @@ def near(first, last, moved, radius, looked, asked):
                     found = np.uint8(0)
                     for y in range(max(i - radius, 0), min(i + radius + 1, H)):
                         for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                            found |= moved[y, x]
-                    asked[i, j] = found
+                            found |= moved[y, x] & mark
+                    asked[i, j] = np.uint8(1) if found != 0 else np.uint8(0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -186,8 +186,8 @@ def poll(first, last, phase, sigma, most, doubt, asked, looked, radius, least, m
 
 
 @by_rows(lambda _changed, _asked, looked, *_: looked.shape[0])
-def move(first, last, changed, asked, looked, bit, phase, reasons, moved, some):
-    """Change orders as elected: `phase` by turns; `moved` (H, W) gets 1, `bit` is taken from `reasons`.
+def move(first, last, changed, asked, looked, bit, mark, phase, reasons, moved, some):
+    """Change orders as elected: `phase` by turns; `moved` (H, W) gets `mark`, `bit` is taken from `reasons`.
 
     `some` (h, w) are the tiles in which an order has changed.
     """
@@ -203,8 +203,30 @@ def move(first, last, changed, asked, looked, bit, phase, reasons, moved, some):
                     if asked[i, j] & 1 and n != 0 and n >= -MOST and n <= MOST:
                         phase[i, j] = phase[i, j] + _TWO_PI * n
                         reasons[i, j] &= ~bit
-                        moved[i, j] = 1
+                        moved[i, j] |= mark
                         some[t, u] = True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def collect(moved, looked):
+    """Rows and columns of the pixels that have moved, all in tiles that are looked at."""
+    H, W = moved.shape
+    rows, columns = np.empty(0, np.int64), np.empty(0, np.int64)
+    for go in range(2):
+        n = 0
+        for t in range(looked.shape[0]):
+            for u in range(looked.shape[1]):
+                if not looked[t, u]:
+                    continue
+                for i in range(t * TILE, min(t * TILE + TILE, H)):
+                    for j in range(u * TILE, min(u * TILE + TILE, W)):
+                        if moved[i, j] != 0:
+                            if go == 1:
+                                rows[n], columns[n] = i, j
+                            n += 1
+        if go == 0:
+            rows, columns = np.empty(n, np.int64), np.empty(n, np.int64)
+    return rows, columns
 
 
 @by_rows(lambda _sigma, _most, _reasons, _bit, _weak, _changed, looked, *_: looked.shape[0])

@@ -67,8 +67,9 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
     view = replace(view, frames=list(view.frames))
     fused = fast.decode(view, rig, s)  # the same in one pass, for the usual plans
     if fused is not None:
-        decoded, xyz, sigma = fused
-        reasons = _masked(decoded, decoded.reasons, rig, s)
+        decoded, xyz, sigma, steps = fused
+        tiles = denoise.Tiles(decoded, (steps,))
+        reasons = _masked(decoded, decoded.reasons, rig, s, tiles)
         grid = triangulate.blanked(xyz, sigma, reasons, rig, decoded.camera)
     else:
         decoded = clean_view(view, rig, s)
@@ -82,7 +83,7 @@ def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
     measured = measured_view(view, s)  # II-C; frames may still be arriving
     decoded = phase.settle_order(measured, view.plan, s.phase, rig, s.denoise.volume_margin)
     reasons = denoise.exposed(decoded, view.plan.pixel_format, s.denoise)  # III-D 1
-    return phase.with_reasons(decoded, _masked(decoded, reasons, rig, s))
+    return phase.with_reasons(decoded, _masked(decoded, reasons, rig, s, denoise.Tiles(decoded)))
 
 
 def _points(decoded: Decoded, rig: Rig, s: Settings) -> Grid:
@@ -90,12 +91,11 @@ def _points(decoded: Decoded, rig: Rig, s: Settings) -> Grid:
     return triangulate.grid(decoded, decoded.reasons, rig, volume_margin=d.volume_margin, rim=d.rim)
 
 
-def _masked(decoded: Decoded, reasons: U16, rig: Rig, s: Settings) -> U16:
-    """The masks that look at a pixel's neighbours, one after the other."""
-    tiles = denoise.Tiles(decoded)
-    reasons = denoise.monotonic(decoded, reasons, rig, s.denoise, tiles)  # III-D 2
-    reasons = denoise.connected(decoded, reasons, rig, s.denoise, tiles)  # III-D 3
-    return denoise.local(decoded, reasons, rig, s.denoise, tiles)
+def _masked(decoded: Decoded, reasons: U16, rig: Rig, s: Settings, tiles: denoise.Tiles) -> U16:
+    """The masks that look at a pixel's neighbours, one after the other; `reasons` change in place."""
+    denoise.monotonic(decoded, reasons, rig, s.denoise, tiles, in_place=True)  # III-D 2
+    denoise.connected(decoded, reasons, rig, s.denoise, tiles, in_place=True)  # III-D 3
+    return denoise.local(decoded, reasons, rig, s.denoise, tiles, in_place=True)
 
 
 BAND = 1_000_000  #: pixels of a board picture that are decoded at a time
@@ -331,15 +331,17 @@ def _silent(_what: str, _share: float) -> None:
 
 
 def _figures(view: ViewInput, decoded: Decoded, grid: Grid) -> dict[str, Any]:
-    """What scan.json tells of a view: noise, sigma, modulation."""
-    ok = grid.valid
-    some = bool(ok.any())
+    """What scan.json tells of a view: noise; medians of sigma and modulation over every n-th of its points."""
+    every = denoise.odd_stride(grid.reasons.size, 1_000_000)
+    cut = (slice(None, None, every), slice(None, None, every))
+    ok = grid.reasons[cut] == 0
+    sigma, A, B = (a[cut][ok] for a in (grid.sigma, decoded.background, decoded.modulation))
     r = view.response
     return {
         "response": None if r is None else {"gamma": r.gamma, "needed": r.needed},
         "noise": {"a": decoded.noise.a, "b": decoded.noise.b, "source": decoded.noise.source},
-        "sigma_median_mm": float(np.median(grid.sigma[ok])) if some else None,
-        "modulation_median": float(np.median(decoded.modulation[ok])) if some else None,
-        "background_median": float(np.median(decoded.background[ok])) if some else None,
+        "sigma_median_mm": float(np.median(sigma)) if ok.any() else None,
+        "modulation_median": float(np.median(B)) if ok.any() else None,
+        "background_median": float(np.median(A)) if ok.any() else None,
         "directions": [list(d.g) for d in decoded.directions],
     }

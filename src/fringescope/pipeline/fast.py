@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,7 +57,16 @@ class _Way:
     usual: F64  #: (8, 8)
 
 
-def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] | None:
+class Fused(NamedTuple):
+    """A decoded view with points (H, W, 3) and their sigma, mm, (H, W) of all pixels, and the steps of its phase."""
+
+    decoded: Decoded
+    xyz: F32
+    sigma_mm: F32
+    steps: F32
+
+
+def decode(view: ViewInput, rig: Rig, s: Settings) -> Fused | None:
     """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
     in one pass; None for a view that the fused kernel does not take.
 
@@ -74,10 +84,10 @@ def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] |
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
         way.notes,
     )
-    moved = phase.vote_on_orders(decoded, s.phase)
-    if moved is not None:
-        _points_again(decoded, *moved, way, rig, s, xyz, sigma_mm)
-    return decoded, xyz, sigma_mm
+    vote = phase.vote_on_orders(decoded, s.phase)
+    if len(vote.rows):
+        _points_again(decoded, vote.rows, vote.columns, way, rig, s, xyz, sigma_mm)
+    return Fused(decoded, xyz, sigma_mm, vote.steps)
 
 
 def _points_again(
