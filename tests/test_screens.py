@@ -24,6 +24,11 @@ def surface(rng, shape, outliers=0.01, masked=0.02, step=False):
     return p.astype(np.float32), sigma.astype(np.float32), reasons
 
 
+def rough(p, sigma, reasons, asked):
+    kind = calm.kinds(calm.steps_of(p), calm.cover_of(reasons), 1.0)
+    screens.rough_pixels(p, sigma, reasons, kind, 1.0, 3.375, 4.5, asked)
+
+
 @settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(40, 60), (9, 700), (6, 5), (4, 4), (30, 517)]), st.booleans())
 def test_pixels_that_are_not_asked_pass_the_local_test(seed, shape, step):
@@ -31,7 +36,7 @@ def test_pixels_that_are_not_asked_pass_the_local_test(seed, shape, step):
     p, sigma, reasons = surface(rng, shape, step=step)
     found = calm.domains(p, sigma, reasons, FIELD, (4.0, 0.2, 4.0), calm.steps_of(p), 1.0)
     asked = np.zeros(shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
+    rough(p, sigma, reasons, asked)
     everywhere, out = np.ones(shape, bool), reasons.copy()
     regions.mark_off_surface(
         p, sigma, found.node, found.label, found.kind, everywhere, 2, 6, 4.5, 2.5, np.uint16(2), out,
@@ -44,7 +49,7 @@ def test_pixels_that_are_not_asked_pass_the_local_test(seed, shape, step):
 def test_most_of_a_calm_surface_is_not_asked(rng):
     p, sigma, reasons = surface(rng, (200, 300), outliers=0.0, masked=0.0)
     asked = np.zeros(p.shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
+    rough(p, sigma, reasons, asked)
     assert asked[2:-2, 2:-2].mean() < 0.05
     assert asked[:2].all()
     assert asked[:, -2:].all()
@@ -54,7 +59,7 @@ def test_a_bad_point_asks_for_all_around_it(rng):
     p, sigma, reasons = surface(rng, (40, 60), outliers=0.0, masked=0.0)
     p[20, 30] += 0.4
     asked = np.zeros(p.shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
+    rough(p, sigma, reasons, asked)
     assert asked[18:23, 28:33].all()
 
 
@@ -64,7 +69,7 @@ def test_masked_pixels_ask_for_all_around_them(rng, hole):
     reasons[20, 2] = 4
     p[20, 2] = hole
     asked = np.zeros(p.shape, bool)
-    screens.rough_pixels(p, sigma, reasons, 1.0, 3.375, 4.5, asked)
+    rough(p, sigma, reasons, asked)
     assert (asked | (reasons != 0))[18:23, :5].all()
     assert not asked[20, 2]
     assert asked[2:-2, 10:-2].mean() < 0.05

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from fringescope import memory
 from fringescope.kernels import domains as k
-from fringescope.kernels import tiles
+from fringescope.kernels import screens, tiles
 from fringescope.kernels.tiles import MIXED, TILE, VOID, WHOLE
 from fringescope.threads import WORKERS, in_bands
 from fringescope.types import F32, F64, U8, U16, AnyArray, Bool
 
-__all__ = ["MIXED", "VOID", "WHOLE", "Domains", "copy_of", "cover_of", "domains", "growing", "linked", "rise",
+__all__ = ["MIXED", "VOID", "WHOLE", "Domains", "copy_of", "cover_of", "domains", "growing", "kinds", "linked", "rise",
            "steps_of", "tally", "update_steps", "widened"]  # fmt: skip
 
 SAFE = 0.999  #: of a limit, so that rounding decides nothing
@@ -88,6 +88,15 @@ def linked(steps: F32, cover: U8, limit: float, around: int = 0) -> Bool:
     if around:
         good = cv2.erode(good.astype(np.uint8), _window(around * TILE)).astype(np.bool_)
     return np.asarray(good)
+
+
+def kinds(steps: F32, cover: U8, limit: float) -> U8:
+    """CALM, VOID or MIXED of each tile (h, w), as `kernels.screens` wants it: `linked` with those around, none at a
+    border.
+    """
+    inner = np.zeros(cover.shape, np.bool_)
+    inner[1:-1, 1:-1] = linked(steps, cover, limit, around=1)[1:-1, 1:-1]
+    return np.where(inner, screens.CALM, np.where(cover == VOID, screens.VOID, screens.MIXED)).astype(np.uint8)
 
 
 def growing(steps: F32, cover: U8, field: F64, shape: tuple[int, int], reach: int) -> Bool:

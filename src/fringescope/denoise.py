@@ -236,7 +236,7 @@ def local(
         for _ in range(int(s.local_rounds)):
             field = _slopes(d, out, decoded, rig)
             found = _domains(d, out, field, s, tiles)
-            asked = _rough(d, out, field, s)
+            asked = _rough(d, out, field, s, tiles)
             k.mark_off_surface(
                 d.phase, d.sigma, found.node, found.label, found.kind, asked, int(s.local_window) // 2,
                 int(s.local_least), s.local_sigma, s.local_roughness, np.uint16(Reason.NOT_LOCAL), out,
@@ -257,12 +257,14 @@ def _least_step(field: F64, s: DenoiseSettings) -> float:
     return max(s.jump_factor * float(field[..., 2].min()), s.jump_floor_rad)
 
 
-def _rough(d: Direction, reasons: U16, field: F64, s: DenoiseSettings) -> Bool:
+def _rough(d: Direction, reasons: U16, field: F64, s: DenoiseSettings, tiles: Tiles) -> Bool:
     """The pixels that have to be judged: those that a quick look does not find calm, if the window is the usual one."""
     asked = memory.empty(reasons.shape, np.bool_)
     if int(s.local_window) == 5:
         limits = min(NEAR, 0.75 * s.local_sigma), min(WIDE, s.local_sigma, 1.8 * s.local_roughness)
-        screens.rough_pixels(d.phase, d.sigma, reasons, _least_step(field, s), *limits, asked)
+        step = _least_step(field, s)
+        kind = calm.kinds(tiles.steps(d), calm.cover_of(reasons), step)
+        screens.rough_pixels(d.phase, d.sigma, reasons, kind, step, *limits, asked)
     else:
         asked[:] = True
     return asked
