@@ -265,11 +265,8 @@ def _judge(variance, background, modulation, coarse_modulation, rough, usual, ab
         a, b, v = background[j], modulation[j], variance[j]
         s = math.sqrt(v)
         sigma[j] = s
-        w = limits.noise_a + limits.noise_b * a
-        noise2 = w if w > _f(ROUNDING) else _f(ROUNDING)
         dark = a < limits.background
-        low = (b < limits.modulation) | (b < limits.contrast * a)
-        low = low | (b * b < limits.modulation_sigma * limits.modulation_sigma * noise2)
+        low = _low(a, b, limits)
         torn = rough[j] > _ZERO
         fine = b * (_ONE + _TWO * TWO_PI * s) < limits.fine_modulation * usual[j] * coarse_modulation[j]
         weak = (s > limits.sigma) | fine
@@ -281,6 +278,30 @@ def _judge(variance, background, modulation, coarse_modulation, rough, usual, ab
         r |= limits.inconsistent if torn else 0
         r |= (limits.outside if s < _INF else 0) if none else (0 if certain else limits.uncertain)
         reasons[j] = r
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _all_dark(background, n, least):
+    lit = np.uint32(0)
+    for j in range(n):
+        lit |= np.uint32(0) if background[j] < least else np.uint32(1)
+    return lit == 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _leave_dark(background, modulation, limits, n, reasons):
+    """Reason bits of a block of dark pixels: dark, and low modulation where it is."""
+    for j in range(n):
+        reasons[j] = limits.dark | (limits.low_modulation if _low(background[j], modulation[j], limits) else 0)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _low(a, b, limits):
+    """Whether modulation b is too low for background a and its noise."""
+    w = limits.noise_a + limits.noise_b * a
+    noise2 = w if w > _f(ROUNDING) else _f(ROUNDING)
+    low = (b < limits.modulation) | (b < limits.contrast * a)
+    return low | (b * b < limits.modulation_sigma * limits.modulation_sigma * noise2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -385,11 +406,11 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
     wrapped, own = np.empty((K, BLOCK), np.float32), np.empty((K, BLOCK), np.float32)
     mod = np.empty((K, BLOCK), np.float32)
     limit = np.empty((4, BLOCK), np.float32)
-    absolute, chi2, margin2, best, best_chi2, second, best_margin2, rough, back, around, fine = (
+    absolute, chi2, margin2, best, best_chi2, second, best_margin2, rough, back, around, fine, other = (
         np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
         np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
         np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
-        np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
+        np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
     )  # fmt: skip
     bits = np.empty(BLOCK, np.uint16)
     one = np.empty((4, K, 1, 1), np.float64)
@@ -426,7 +447,9 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
             brightest = top[0]
             for j in range(n):
                 brightest = max(brightest, top[j])
-            for k in range(K):
+            dark = False
+            for back_to_front in range(K):  # the finest set first: where it is dark all over, nothing else is worked out
+                k = K - 1 - back_to_front
                 a, b = sets.start[k], sets.start[k + 1]
                 pivot = sets.pivot
                 if b - a == 4 and sets.plain[k]:
@@ -437,8 +460,26 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
                     pivot = _ZERO
                 else:
                     _sums(x, a, b, sets.cos, sets.sin, pivot, n, acc)
-                _fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k], back,
-                     mod[k], rough)  # fmt: skip
+                _fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k],
+                     back if k == K - 1 else other, mod[k], rough)  # fmt: skip
+                if k == K - 1 and brightest < sets.top:
+                    dark = _all_dark(back, n, limits.background)
+                if dark:
+                    break
+            if dark:
+                _leave_dark(back, mod[K - 1], limits, n, bits)
+                point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
+                out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
+                out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
+                b, fine_2 = mod[K - 1], own[K - 1]
+                for j in range(n):
+                    along[j] = point[j, 0] = point[j, 1] = point[j, 2] = out_phase[j] = _NAN
+                for j in range(n):
+                    out_sigma[j] = TWO_PI * math.sqrt(fine_2[j])
+                    out_a[j] = back[j]
+                    out_b[j] = b[j]
+                    out_r[j] = bits[j]
+                continue
             for m in range(2):
                 _ramp(limit_row[m], limit_scale, col, n, limit[m])
             _ramp(usual_row, usual_scale, col, n, around)
