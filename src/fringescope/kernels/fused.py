@@ -14,10 +14,10 @@ from numba import njit
 
 from fringescope.kernels.depths import mark_outside, points, row_cubics
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
-from fringescope.kernels.sinusoid import ROUNDING, follow, left_over, phase_variance, turns
+from fringescope.kernels.pixel import TWO_PI, fitted, judged, weighed
+from fringescope.kernels.sinusoid import ROUNDING, follow, phase_variance
 
 BLOCK = 512  #: pixels of a row that are worked on together
-TWO_PI = np.float32(2 * math.pi)
 
 _f = np.float32
 _ZERO, _HALF, _ONE, _TWO = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0))
@@ -101,17 +101,14 @@ def _fit(acc, steps, noise_a, noise_b, pivot, n, phase, sigma, background, modul
     mean, gain = _ONE / _f(steps), _TWO / _f(steps)
     share = _ONE / _f(steps - 3) if steps > 3 else _ZERO
     for j in range(n):
-        t, p, q = acc[j], acc[_P + j], acc[_Q + j]
-        a, c, s = t * mean, p * gain, q * gain
-        b = math.sqrt(c * c + s * s)
-        rest = left_over(acc[_S + j], t, p, q, a, c, s, share)
-        a += pivot
-        v = max(noise_a + noise_b * a, _f(ROUNDING))
-        phase[j] = turns(s, c)
+        wrapped, a, b, v, misfit = fitted(
+            acc[j], acc[_P + j], acc[_Q + j], acc[_S + j], mean, gain, share, noise_a, noise_b, pivot
+        )
+        phase[j] = wrapped
         background[j] = a
         modulation[j] = b
         sigma[j] = v
-        rough[j] = max(rough[j], rest / v)
+        rough[j] = max(rough[j], misfit)
     if steps == 3:
         for j in range(n):
             b = modulation[j]
@@ -160,14 +157,14 @@ def _consider(absolute, chi2, margin2, bounds, unexpected, n, best, best_chi2, s
     """Keep the order if it lies in the bounds and fits better; remember how well the next best fits."""
     lo, hi, soft_lo, soft_hi = bounds[0], bounds[1], bounds[2], bounds[3]
     for j in range(n):
-        a = absolute[j]
-        cost = chi2[j] + (unexpected if a < soft_lo[j] or a > soft_hi[j] else _ZERO)
-        cost = cost if a >= lo[j] and a <= hi[j] else _INF
-        better = cost < best_chi2[j]
-        second[j] = best_chi2[j] if better else min(second[j], cost)
-        best_margin2[j] = margin2[j] if better else best_margin2[j]
-        best[j] = a if better else best[j]
-        best_chi2[j] = cost if better else best_chi2[j]
+        a, cost, next_cost, margin = weighed(
+            absolute[j], chi2[j], margin2[j], lo[j], hi[j], soft_lo[j], soft_hi[j], unexpected,
+            best[j], best_chi2[j], second[j], best_margin2[j],
+        )  # fmt: skip
+        best[j] = a
+        best_chi2[j] = cost
+        second[j] = next_cost
+        best_margin2[j] = margin
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -186,21 +183,10 @@ def _judge(sigma, background, modulation, coarse_modulation, rough, usual, absol
            n, reasons):  # fmt: skip
     """Reason bits of unsaturated pixels: exposure (III-D 1), order, consistency."""
     for j in range(n):
-        a, b = background[j], modulation[j]
-        noise = math.sqrt(max(limits.noise_a + limits.noise_b * a, _f(ROUNDING)))
-        dark = a < limits.background
-        low = b < limits.modulation or b < limits.contrast * a or b < limits.modulation_sigma * noise
-        torn = rough[j] > limits.misfit
-        fine = b / coarse_modulation[j] * (_ONE + _TWO * TWO_PI * sigma[j]) < limits.fine_modulation * usual[j]
-        weak = sigma[j] > limits.sigma or fine
-        low = low or (weak and not dark and not torn)
-        none = absolute[j] != absolute[j]
-        certain = min(second[j] - best_chi2[j], margin2[j]) >= limits.margin
-        r = limits.dark if dark else 0
-        r |= limits.low_modulation if low else 0
-        r |= limits.inconsistent if torn else 0
-        r |= (limits.outside if sigma[j] < _INF else 0) if none else (0 if certain else limits.uncertain)
-        reasons[j] = r
+        reasons[j] = judged(
+            background[j], modulation[j], coarse_modulation[j], sigma[j], rough[j], usual[j], absolute[j],
+            best_chi2[j], second[j], margin2[j], limits,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
