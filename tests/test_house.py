@@ -41,6 +41,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "types": ({"errors"}, "data, no behaviour"),
     "settings": ({"errors"}, "data, no behaviour"),
     "threads": (set(), "rows on all cores: knows nothing of what the rows hold"),
+    "gpu": ({"threads"}, "slabs of rows through a GPU: knows nothing of what the rows hold"),
     "kernels": ({"threads"}, "arrays in, arrays out: they know no dataclass, file or device"),
     "geometry": (DATA | {"kernels"}, "poses and lenses on top of the lens kernels"),
     **dict.fromkeys(STAGES, (BOTTOM, "stages never import each other: what passes between them is a type")),
@@ -52,7 +53,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "store": (DATA, "files know data, not algorithms"),
     "importing": (DATA | {"store"}, "other people's images become one of our captures"),
     "export": (DATA, "files know data, not algorithms"),
-    "pipeline": (BOTTOM | STAGES | {"capture", "threads"}, "all ordering lives here: objects, no files"),
+    "pipeline": (BOTTOM | STAGES | {"capture", "threads", "gpu"}, "all ordering lives here: objects, no files"),
     "server": (ANYTHING, "the rim: nobody imports it"),
     "bench": (ANYTHING, "times the whole, for the command line alone"),
     "warmup": (ANYTHING, "a tiny scan from end to end, for the command line alone"),
@@ -67,7 +68,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 #: Packages that only some units may import, and which.
 CONFINED = {
-    "numba": {"kernels", "threads", "twin"},
+    "numba": {"kernels", "threads", "twin", "gpu"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"report", "evaluate"},

@@ -190,7 +190,7 @@ def _judge(sigma, background, modulation, coarse_modulation, rough, usual, absol
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulation, used):
+def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulation, used):
     """A pixel with saturated samples, by the scalar way, in float64: its reasons, phase, sigma, A, B of the finest set.
 
     `phase` .. `modulation` (K, 1, 1) and `used` (K, 2) are scratch. A coarse set of two samples borrows the background
@@ -310,8 +310,8 @@ def decode(first, last, frames, row0, height, sets, limits, bounds, usual, depth
         slack += _f(sets.frequency[0] / sets.frequency[k])
     slack = _HALF * slack + _f(0.01)
     for i in range(first, last):
-        _rows_between(bounds, row0 + i, height, limit_row)
-        _row_between(usual, row0 + i, height, usual_row)
+        rows_between(bounds, row0 + i, height, limit_row)
+        row_between(usual, row0 + i, height, usual_row)
         row_cubics(depths.table, row0 + i, depths.step, row)
         for col in range(0, W, BLOCK):
             n = min(BLOCK, W - col)
@@ -349,7 +349,7 @@ def decode(first, last, frames, row0, height, sets, limits, bounds, usual, depth
                    best_margin2, limits, n, bits)  # fmt: skip
             for j in range(n):
                 if top[j] >= sets.top:
-                    bits[j], best[j], own[K - 1, j], back[j], mod[K - 1, j] = _clipped_pixel(
+                    bits[j], best[j], own[K - 1, j], back[j], mod[K - 1, j] = clipped_pixel(
                         x, j, sets, limits, limit, one[0], one[1], one[2], one[3], used
                     )
             points(best, own[K - 1], row, depths, col, n, X, Y, Z, sigma_mm[i, col : col + n])
@@ -372,7 +372,7 @@ def decode(first, last, frames, row0, height, sets, limits, bounds, usual, depth
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _row_between(nodes, i, height, out):
+def row_between(nodes, i, height, out):
     """Row i of a picture of `height` rows from nodes (h, w) that span it corner on corner."""
     h = nodes.shape[0]
     y = i * (h - 1) / max(height - 1, 1)
@@ -384,6 +384,7 @@ def _row_between(nodes, i, height, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _rows_between(nodes, i, height, out):
+def rows_between(nodes, i, height, out):
+    """`row_between` of a stack of nodes (n, h, w), into `out` (n, w)."""
     for m in range(nodes.shape[0]):
-        _row_between(nodes[m], i, height, out[m])
+        row_between(nodes[m], i, height, out[m])

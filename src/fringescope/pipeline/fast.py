@@ -10,6 +10,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -38,6 +39,8 @@ from fringescope.types import (
     ViewPlan,
 )
 
+Device = Literal["cpu", "gpu"]  #: where the fused kernel runs
+
 MOST_ERROR_MM = 1e-4  #: of the depth table against the exact solution
 LARGE = 1 << 20  #: samples of a band of all frames: they stay in the second cache
 TWO_PI = 2 * np.pi
@@ -45,7 +48,7 @@ f4 = np.float32
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class Way:
     """What the kernel needs to know of a view: its frames in the order of its sets, coarse to fine, and the tables."""
 
     frames: tuple[AnyArray, ...]
@@ -60,19 +63,27 @@ class _Way:
     usual: F64  #: (8, 8)
 
 
-def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] | None:
+def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> tuple[Decoded, F32, F32] | None:
     """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
-    in one pass; None for a view that the fused kernel does not take.
+    in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
     `view.frames` must be a sequence. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
     """
-    way = _way(view, rig, s)
+    way = way_of(view, rig, s)
     if way is None:
         return None
     H, W = way.frames[0].shape
     absolute, sigma, A, B, sigma_mm = (np.empty((H, W), np.float32) for _ in range(5))
     reasons, xyz = np.empty((H, W), np.uint16), np.empty((H, W, 3), np.float32)
-    _by_bands(way, (absolute, sigma, A, B, reasons, xyz, sigma_mm))
+    out = (absolute, sigma, A, B, reasons, xyz, sigma_mm)
+    if device == "gpu":
+        from fringescope.pipeline import gpu  # only then: Numba's CUDA is slow to import
+
+        if not gpu.takes(way.sets):
+            return None
+        gpu.by_slabs(way.frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
+    else:
+        _by_bands(way, out)
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -85,7 +96,7 @@ def decode(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, F32, F32] |
 
 
 def _points_again(
-    decoded: Decoded, moved: Bool, way: _Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
+    decoded: Decoded, moved: Bool, way: Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
 ) -> None:
     """Points of the pixels whose order the vote has changed, by the same table in float64."""
     rows, columns = np.nonzero(moved)
@@ -107,7 +118,8 @@ def _points_again(
     decoded.reasons[moved] = np.where(inside, decoded.reasons[moved] & ~bit, decoded.reasons[moved] | bit)
 
 
-def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
+def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
+    """What the kernel needs to know of a view; None for one that it does not take."""
     plan, camera = view.plan, rig.camera(view.plan.camera)
     family = _parallel(plan)
     frames = _in_order(view, family) if family else None
@@ -145,7 +157,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
     limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
     depths = _depths(table, rig, camera, s)
-    return _Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
+    return Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
 def _parallel(plan: ViewPlan) -> list[tuple[int, tuple[float, float]]] | None:
@@ -229,7 +241,7 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
     )
 
 
-def _by_bands(way: _Way, out: tuple[AnyArray, ...]) -> None:
+def _by_bands(way: Way, out: tuple[AnyArray, ...]) -> None:
     """Runs the kernel over bands of rows on all cores; each core copies the rows of all frames into its own scratch."""
     H, W = way.frames[0].shape
     rows = max(1, min(LARGE // (len(way.frames) * W), -(-H // WORKERS)))
