@@ -20,6 +20,7 @@ from fringescope.kernels.sinusoid import follow, phase_variance, whole
 MAX_SETS = 8  #: of a view: what a thread has room for
 MAX_FRAMES = 128
 THREADS = 128  #: of a block: pixels of a row
+BLOCKS = 128  #: of a launch at least: Numba warns of fewer; the spare ones have nothing to do
 CLIPPED = np.uint16(0xFFFF)  #: mark of a pixel with saturated samples, until `clipped` has looked at it
 
 _f = np.float32
@@ -224,7 +225,7 @@ def _decode(band, sets, limits, rows, depths):
     i, j = cuda.blockIdx.y, cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     wrapped = cuda.local.array(MAX_SETS, np.float32)
     wide = cuda.local.array(MAX_SETS, np.float32)
-    if j < band.frames.shape[2]:
+    if i < band.frames.shape[1] and j < band.frames.shape[2]:
         decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide)
 
 
@@ -235,18 +236,18 @@ def _clipped(band, sets, limits, rows, depths):
     bounds = cuda.local.array((4, 1), np.float32)
     one = cuda.local.array((4, MAX_SETS, 1, 1), np.float64)
     used = cuda.local.array((MAX_SETS, 2), np.uint64)
-    if j < band.frames.shape[2]:
+    if i < band.frames.shape[1] and j < band.frames.shape[2]:
         decode_clipped(band, i, j, sets, limits, rows, depths, x, bounds, one, used)
 
 
 def rows(height: int, depths: Depths, nodes: Nodes, out: Rows) -> None:
     """Launch: fill `out`, a `Rows` on the device, for a picture of `height` rows."""
-    _rows[-(-height // 64), 64](height, depths, nodes, out)
+    _rows[max(-(-height // 32), BLOCKS), 32](height, depths, nodes, out)
 
 
 def decode(band: Band, sets: Sets, limits: Limits, rows: Rows, depths: Depths, stream: Any) -> None:
     """Launch on a stream: a `Band` on the device from frames to points. Bands of 65535 rows at most."""
     _, height, width = band.frames.shape
-    grid = (-(-width // THREADS), height)
+    grid = (-(-width // THREADS), max(height, BLOCKS))
     _decode[grid, (THREADS, 1), stream](band, sets, limits, rows, depths)
     _clipped[grid, (THREADS, 1), stream](band, sets, limits, rows, depths)

@@ -83,7 +83,7 @@ def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> tu
             return None
         gpu.by_slabs(way.frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
     else:
-        _by_bands(way, out)
+        by_bands(way, out)
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -241,7 +241,7 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
     )
 
 
-def _by_bands(way: Way, out: tuple[AnyArray, ...]) -> None:
+def by_bands(way: Way, out: tuple[AnyArray, ...]) -> None:
     """Runs the kernel over bands of rows on all cores; each core copies the rows of all frames into its own scratch."""
     H, W = way.frames[0].shape
     rows = max(1, min(LARGE // (len(way.frames) * W), -(-H // WORKERS)))
