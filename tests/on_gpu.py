@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba import njit
 
 from fringescope import gpu, pipeline
-from fringescope.kernels import gpu as kernels
+from fringescope.kernels import gpu as k
 from fringescope.pipeline import fast
 from fringescope.pipeline import gpu as way_of
 from fringescope.settings import Settings
@@ -22,6 +23,56 @@ from tests.test_fused import bowl, rig_of, view_of
 
 S = Settings()
 DARK = Reason.DARK | Reason.LOW_MODULATION  # orders of such pixels mean nothing
+f4 = np.float32
+
+
+@njit
+def _rows_one_by_one(height, depths, nodes, out):
+    for i in range(height):
+        k.row_of(i, height, depths, nodes, out)
+
+
+@njit
+def _pixels_one_by_one(band, sets, limits, rows, depths, wrapped, wide, x, bounds, one, used):
+    for i in range(band.frames.shape[1]):
+        for j in range(band.frames.shape[2]):
+            k.decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide)
+            k.decode_clipped(band, i, j, sets, limits, rows, depths, x, bounds, one, used)
+
+
+def empty(height, width):
+    return [np.empty((height, width, 3)[: 3 if f.channels else 2], f.dtype) for f in way_of.FIELDS]
+
+
+def tables(way, height):
+    nodes = k.Nodes(way.bounds, way.usual)
+    rows = k.Rows(
+        np.empty((height, way.depths.table.shape[1]), f4), np.empty((4, height, way.bounds.shape[2])),
+        np.empty((height, way.usual.shape[1])),
+    )  # fmt: skip
+    return nodes, rows
+
+
+def by_loops(way):
+    """The kernels of the GPU as plain loops on the processor, over all pixels of a view."""
+    height, width = way.frames[0].shape
+    out = empty(height, width)
+    nodes, rows = tables(way, height)
+    _rows_one_by_one(height, way.depths, nodes, rows)
+    _pixels_one_by_one(
+        k.Band(np.stack(way.frames), 0, *out), way.sets, way.limits, rows, way.depths, np.empty(k.MAX_SETS, f4),
+        np.empty(k.MAX_SETS, f4), np.empty((k.MAX_FRAMES, 1), np.uint16), np.empty((4, 1), f4),
+        np.empty((4, k.MAX_SETS, 1, 1)), np.empty((k.MAX_SETS, 2), np.uint64),
+    )  # fmt: skip
+    return out
+
+
+@pytest.fixture(scope="session")
+def compiled():
+    """What the simulator's kernels call, compiled before many threads ask for it at once."""
+    rig = rig_of(64, 9)
+    views = [view_of(rig, rig.cameras[1], fmt) for fmt in (PixelFormat.MONO8, PixelFormat.MONO16)]
+    return [by_loops(fast.way_of(view, rig, S)) for view in views]
 
 
 def compare(view, rig, apart=0.002, s=S):
@@ -46,13 +97,13 @@ def compare(view, rig, apart=0.002, s=S):
 
 
 @pytest.fixture
-def small(monkeypatch):
+def small(monkeypatch, compiled):  # noqa: ARG001
     """A rig of small odd pictures, and slabs of a few rows: more of them than buffers, the last one not full."""
     gpu.slabs.cache_clear()
     monkeypatch.setattr(gpu, "SLAB", 4 * 41 * (16 + 34))
     if gpu.SIMULATED:
-        monkeypatch.setattr(kernels, "THREADS", 8)  # each of them is a thread of the processor
-        monkeypatch.setattr(kernels, "BLOCKS", 1)
+        monkeypatch.setattr(k, "THREADS", 8)  # each of them is a thread of the processor
+        monkeypatch.setattr(k, "BLOCKS", 1)
     yield rig_of(41, 15)
     gpu.slabs.cache_clear()
 
@@ -63,7 +114,8 @@ def test_every_depth(small, fmt):
 
 
 @pytest.mark.parametrize(
-    ("periods", "steps"), [((270.0, 60.0, 16.0), (3, 3, 3)), ((270.0, 90.0, 40.0, 16.0), (4, 3, 5, 7)), ((250.0,), (8,))]
+    ("periods", "steps"),
+    [((270.0, 60.0, 16.0), (3, 3, 3)), ((270.0, 90.0, 40.0, 16.0), (4, 3, 5, 7)), ((250.0,), (8,))],
 )
 def test_every_plan(small, periods, steps):
     compare(view_of(small, small.cameras[2], PixelFormat.MONO12, periods, steps), small)
@@ -136,7 +188,8 @@ def test_a_whole_view(small):
 
 
 def test_a_plan_for_the_stages_says_so(small):
-    view = view_of(small, small.cameras[1], PixelFormat.MONO8, periods=(270.0, 100.0, 60.0, 16.0), steps=(33, 33, 33, 34))
+    """133 frames are more than a thread has room for."""
+    view = view_of(small, small.cameras[1], PixelFormat.MONO8, (270.0, 100.0, 60.0, 16.0), (33, 33, 33, 34))
     assert fast.decode(view, small, S) is not None
     decoded, got = pipeline.scan_view(view, small, S, device="gpu")
     _, want = pipeline.scan_view(view, small, S)

@@ -1,4 +1,4 @@
-"""The GPU without a GPU: its kernels as plain loops, in Numba's simulator, compiled for a card that is not here; errors."""
+"""The GPU without a GPU: its kernels as plain loops, in Numba's simulator, and compiled for a card that is not here."""
 
 import importlib.util
 import os
@@ -10,22 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numba import njit
 
 from fringescope import gpu, pipeline
 from fringescope.cli import run
 from fringescope.errors import UsageError
 from fringescope.kernels import gpu as k
 from fringescope.pipeline import fast
-from fringescope.pipeline import gpu as way_of
-from fringescope.settings import Settings
-from fringescope.types import PixelFormat, Reason
+from fringescope.types import PixelFormat
+from tests.on_gpu import DARK, S, by_loops, empty, tables
 from tests.test_fused import rig_of, view_of
 
-S = Settings()
 ROOT = Path(__file__).resolve().parents[1]
-DARK = Reason.DARK | Reason.LOW_MODULATION
-f4 = np.float32
 
 
 def test_in_the_simulator():
@@ -36,33 +31,6 @@ def test_in_the_simulator():
     )
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
     assert "skipped" not in done.stdout
-
-
-@njit
-def _rows_one_by_one(height, depths, nodes, out):
-    for i in range(height):
-        k.row_of(i, height, depths, nodes, out)
-
-
-@njit
-def _pixels_one_by_one(band, sets, limits, rows, depths, wrapped, wide, x, bounds, one, used):
-    for i in range(band.frames.shape[1]):
-        for j in range(band.frames.shape[2]):
-            k.decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide)
-            k.decode_clipped(band, i, j, sets, limits, rows, depths, x, bounds, one, used)
-
-
-def empty(height, width):
-    return [np.empty((height, width, 3)[: 3 if f.channels else 2], f.dtype) for f in way_of.FIELDS]
-
-
-def tables(way, height):
-    nodes = k.Nodes(way.bounds, way.usual)
-    rows = k.Rows(
-        np.empty((height, way.depths.table.shape[1]), f4), np.empty((4, height, way.bounds.shape[2])),
-        np.empty((height, way.usual.shape[1])),
-    )  # fmt: skip
-    return nodes, rows
 
 
 @pytest.mark.parametrize(
@@ -81,15 +49,9 @@ def test_a_thread_does_what_the_loops_do(fmt, periods, steps, brightness):
     view = view_of(rig, rig.cameras[1], fmt, periods, steps, A=brightness, B=0.3)
     way = fast.way_of(view, rig, S)
     height, width = way.frames[0].shape
-    want, got = empty(height, width), empty(height, width)
+    want = empty(height, width)
     fast.by_bands(way, tuple(want))
-    nodes, rows = tables(way, height)
-    _rows_one_by_one(height, way.depths, nodes, rows)
-    _pixels_one_by_one(
-        k.Band(np.stack(way.frames), 0, *got), way.sets, way.limits, rows, way.depths, np.empty(k.MAX_SETS, f4),
-        np.empty(k.MAX_SETS, f4), np.empty((k.MAX_FRAMES, 1), np.uint16), np.empty((4, 1), f4),
-        np.empty((4, k.MAX_SETS, 1, 1)), np.empty((k.MAX_SETS, 2), np.uint64),
-    )  # fmt: skip
+    got = by_loops(way)
     lit = ((want[4] | got[4]) & DARK) == 0
     assert ((want[4] != got[4]) & lit).mean() <= 0.001
     assert (((want[4] ^ got[4]) & DARK) != 0).mean() <= 0.001

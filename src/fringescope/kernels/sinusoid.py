@@ -27,7 +27,7 @@ def whole(x):
     return np.floor(x)
 
 
-@overload(whole, inline="always")
+@overload(whole, inline="always", target="cpu")
 def _whole(x):  # noqa: ARG001
     return lambda x: np.floor(x)
 
