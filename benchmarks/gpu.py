@@ -64,7 +64,7 @@ def apart(way: fast.Way) -> dict[str, float]:
 
 
 def equal(one: dict[str, float]) -> bool:
-    close = one["phase_rad"] <= one["phase_rad_allowed"] and one["xyz_mm"] <= 2e-5
+    close = one["phase_rad"] <= one["phase_rad_allowed"] and one["xyz_mm"] <= 5e-5
     return close and one["other_reasons"] <= 0.002 and one["valid"] > 0.2
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Resolves constraints/core.txt, constraints/dev.txt and constraints/gpu.txt from pyproject.toml: one set of versions for Python 3.11 to 3.13
-# on every platform, with hashes and without the address of any index. Commit the files.
+# Resolves constraints/core.txt, dev.txt and gpu.txt from pyproject.toml: one set of versions for Python 3.11 to 3.13 on
+# every platform, with hashes and without the address of any index. Commit the files.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${1:-python3}

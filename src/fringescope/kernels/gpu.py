@@ -213,14 +213,14 @@ def decode_clipped(band, i, j, sets, limits, rows, depths, x, bounds, one, used)
     _finish(band, i, j, depths, rows.cubics[band.row0 + i], _f(turn), _f(own), _f(a), _f(b), reasons, limits)
 
 
-@cuda.jit
+@cuda.jit(cache=True)
 def _rows(height, depths, nodes, out):
     i = cuda.grid(1)
     if i < height:
         row_of(i, height, depths, nodes, out)
 
 
-@cuda.jit
+@cuda.jit(cache=True)
 def _decode(band, sets, limits, rows, depths):
     i, j = cuda.blockIdx.y, cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     wrapped = cuda.local.array(MAX_SETS, np.float32)
@@ -229,7 +229,7 @@ def _decode(band, sets, limits, rows, depths):
         decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide)
 
 
-@cuda.jit
+@cuda.jit(cache=True)
 def _clipped(band, sets, limits, rows, depths):
     i, j = cuda.blockIdx.y, cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     x = cuda.local.array((MAX_FRAMES, 1), np.uint16)
