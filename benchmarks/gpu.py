@@ -47,7 +47,7 @@ def parts(way: fast.Way) -> tuple[Any, ...]:
 def apart(way: fast.Way) -> dict[str, float]:
     """Share of pixels with other reasons, and the largest differences where both have none."""
     want, got = room(way), room(way)
-    fast.by_bands(way, tuple(want))
+    fast.on_cpu(way, tuple(want))
     on_gpu.by_slabs(*parts(way), got)
     dark = ((want[4] | got[4]) & (Reason.DARK | Reason.LOW_MODULATION)) != 0
     good = (want[4] == 0) & (got[4] == 0)
@@ -92,7 +92,7 @@ def three(
     jobs: dict[str, Callable[[], Any]] = {
         "gpu_all_results_s": lambda: [on_gpu.by_slabs(*parts(w), o) for w, o in pairs],
         "gpu_points_s": lambda: [on_gpu.by_slabs(*parts(w), o) for w, o in zip(ways, few, strict=True)],
-        "cpu_all_results_s": lambda: [fast.by_bands(w, tuple(o)) for w, o in pairs],
+        "cpu_all_results_s": lambda: [fast.on_cpu(w, tuple(o)) for w, o in pairs],
         "statistics_s": lambda: [fast.way_of(v, rig, s) for v in views],
         "gpu_decode_s": lambda: [fast.decode(v, rig, s, "gpu") for v in views],
         "cpu_decode_s": lambda: [fast.decode(v, rig, s) for v in views],

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fringescope import geometry, phase
+from fringescope import calm, geometry, phase
 from fringescope.errors import CaptureError
 from fringescope.kernels import fringes as kernels
-from fringescope.kernels import regions
+from fringescope.kernels import regions, votes
 from fringescope.types import FringeSet, NoiseModel
 from tests import fuse_scenes as scenes
 from tests.reference import fringes as reference
@@ -307,12 +307,24 @@ def test_order_votes_equal_their_twin(seed):
     smooth = 0.3 * x + 0.2 * y + 3 * (x > 8) + rng.normal(0, 0.1, x.shape)
     p = (smooth + TWO_PI * rng.choice([0, 0, 0, 0, 1, -1, 2, 12], x.shape)).astype(np.float32)
     p[rng.random(p.shape) < 0.1] = np.nan
-    out, changed = np.empty_like(p), np.empty(p.shape, np.int8)
     voters = np.where(rng.random(p.shape) < 0.2, np.float32(np.nan), p)
-    kernels.order_votes(p, voters, np.ones(p.shape, bool), 2, 6, 0.7, 0.9, out, changed)
+    sigma = np.where(np.isnan(voters), np.float32(1), np.float32(0.1))
+    changed, moved = np.empty(p.shape, np.int8), np.zeros(p.shape, np.uint8)
+    asked, looked, some = np.ones(p.shape, np.uint8), np.ones((2, 2), bool), np.empty((2, 2), bool)
+    votes.poll(p, sigma, 0.5, np.zeros((0, 0), np.uint8), asked, looked, 2, 6, 0.7, 0.9, changed)
     want, want_changed = reference.votes(p, voters, 2, 6, 0.7, 0.9)
     np.testing.assert_array_equal(changed, want_changed)
-    np.testing.assert_allclose(out, want, atol=1e-4)
+    barred = np.isnan(voters).astype(np.uint8) * np.uint8(2)  # those who are in doubt do not vote
+    again = np.empty(p.shape, np.int8)
+    votes.poll(p, np.full_like(sigma, 0.1), 0.5, barred, asked, looked, 2, 6, 0.7, 0.9, again)
+    np.testing.assert_array_equal(again, want_changed)
+    reasons = np.full(p.shape, 9, np.uint16)
+    votes.move(changed, asked, looked, np.uint16(8), p, reasons, moved, some)
+    np.testing.assert_allclose(p, want, atol=1e-4)
+    turned = (changed != 0) & (np.abs(changed.astype(int)) <= 8)
+    np.testing.assert_array_equal(moved != 0, turned)
+    np.testing.assert_array_equal(reasons, np.where(turned, 1, 9))
+    assert some.any() == turned.any()
 
 
 @pytest.mark.parametrize("reading", ["inverse", "threshold"])
@@ -346,14 +358,19 @@ def test_gradient_votes_equal_their_twins(seed):
     rng = np.random.default_rng(seed)
     p, sigma, reasons = bumpy(rng)
     field = np.dstack([rng.normal(1.5, 1, (3, 4)), rng.normal(0.5, 1, (3, 4)), np.ones((3, 4))])
-    signs, back = np.empty(p.shape, np.int8), np.empty(p.shape, np.bool_)
-    regions.gradient_signs(p, sigma, reasons, field, 2, 3.0, signs)
+    asked, backward = np.ones((2, 3), bool), np.empty((2, 3), bool)
+    signs = np.empty(p.shape, np.int8)
+    regions.gradient_signs(p, sigma, reasons, asked, field, 2, 3.0, signs, backward)
     want = slow.gradient_signs(p, sigma, reasons, field, 2, 3.0)
     np.testing.assert_array_equal(signs, want)
     assert (signs == 1).any()
+    tiles = [[(want[y : y + 8, x : x + 8] < 0).any() for x in (0, 8, 16)] for y in (0, 8)]
+    np.testing.assert_array_equal(backward, tiles)
     mixed = np.where(rng.random(p.shape) < 0.5, -signs, signs).astype(np.int8)
-    regions.majority_backward(mixed, 2, 0.6, 4, back)
-    np.testing.assert_array_equal(back, slow.majority_backward(mixed, 2, 0.6, 4))
+    before = reasons.copy()
+    regions.mark_backward(mixed, asked, 2, 0.6, 4, np.uint16(2), reasons)
+    back = slow.majority_backward(mixed, 2, 0.6, 4)
+    np.testing.assert_array_equal(reasons, np.where(back & (before == 0), 2, before))
 
 
 @settings(max_examples=15)
@@ -364,17 +381,46 @@ def test_domains_equal_scipy_components(seed):
     field = np.dstack([np.ones((3, 4, 2)), rng.uniform(0.05, 0.2, (3, 4, 1))])
     factor, floor, noise = 2.5, 0.2, 2.0
     limit = np.maximum(factor * slow.spread(field, p.shape)[..., 2], floor), noise
-    loose = np.empty(p.shape, np.bool_)
-    regions.loose_pixels(p, sigma, reasons, field, factor, floor, noise, 5, loose)
-    np.testing.assert_array_equal(loose, slow.loose_pixels(p, sigma, reasons, limit, 5))
-    label = np.empty(p.shape, np.int32)
-    sizes = regions.domains(p, sigma, reasons, field, factor, floor, noise, label)
+    out = reasons.copy()
+    regions.mark_loose(p, sigma, reasons, np.ones((2, 3), bool), field, factor, floor, noise, 5, np.uint16(4), out)
+    np.testing.assert_array_equal(out == 4, slow.loose_pixels(p, sigma, reasons, limit, 5))
+    same_domains(p, sigma, reasons, field, (factor, floor, noise), limit)
+
+
+def same_domains(p, sigma, reasons, field, limits, limit):
+    """Domains over calm tiles and single pixels are scipy's over pixels; returns the share of calm tiles."""
+    least_step = max(limits[0] * field[..., 2].min(), limits[1])
+    found = calm.domains(p, sigma, reasons, field, limits, calm.steps_of(p), least_step)
+    label, sizes = found.labels(p.shape), found.sizes
     want = slow.domains(p, sigma, reasons, limit)
     np.testing.assert_array_equal(label < 0, want == 0)
     assert len(sizes) == want.max()
     pairs = set(zip(label[label >= 0].tolist(), want[want > 0].tolist(), strict=True))
     assert len(pairs) == len(sizes)  # a one-to-one renaming
     np.testing.assert_array_equal(sizes, np.bincount(label[label >= 0], minlength=len(sizes)))
+    marked = reasons.copy()
+    found.mark_small(20, np.uint16(2), marked)
+    np.testing.assert_array_equal(marked == 2, (label >= 0) & (sizes[label] < 20))
+    return float((found.kind == 1).mean())
+
+
+@settings(max_examples=15)
+@given(seeds, st.sampled_from([(150, 60), (70, 203), (33, 7), (1, 90), (200, 1)]))
+def test_domains_of_calm_tiles_in_bands_equal_scipy_components(seed, shape):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    p = 0.25 * x + 0.1 * y + 3.0 * (np.hypot(x - 30, y - 40) < 25) + 4.0 * (y % 64 == 63)
+    sigma = np.full(shape, 0.02)
+    p = (p + sigma * rng.normal(size=shape)).astype(np.float32)
+    reasons = (rng.random(shape) < 0.004).astype(np.uint16)
+    for _ in range(6):  # holes of every width, lines of masked pixels too
+        a, b, h, w = rng.integers(0, shape[0]), rng.integers(0, shape[1]), *rng.integers(1, 30, 2)
+        reasons[a : a + h, b : b + w] = 1
+    p[(reasons != 0) & (rng.random(shape) < 0.5)] = np.nan
+    field = np.dstack([np.ones((3, 4, 2)), rng.uniform(0.2, 0.3, (3, 4, 1))])
+    limit = np.maximum(4.0 * slow.spread(field, p.shape)[..., 2], 0.2), 4.0
+    share = same_domains(p, sigma.astype(np.float32), reasons, field, (4.0, 0.2, 4.0), limit)
+    assert share > 0.2 or min(shape) < 60
 
 
 @settings(max_examples=8)
@@ -383,10 +429,15 @@ def test_local_surface_equals_robust_least_squares(seed):
     rng = np.random.default_rng(seed)
     p, sigma, reasons = bumpy(rng, (12, 14))
     field = np.dstack([np.ones((2, 2, 2)), np.full((2, 2, 1), 0.25)])
-    label = np.empty(p.shape, np.int32)
-    regions.domains(p, sigma, reasons, field, 4.0, 0.2, 4.0, label)
-    out, roughness = np.empty_like(p), np.empty_like(p)
-    regions.local_surface(p, sigma, label, np.ones(p.shape, bool), 2, 6, out, roughness)
+    found = calm.domains(p, sigma, reasons, field, (4.0, 0.2, 4.0), calm.steps_of(p), 1.0)
+    label = found.labels(p.shape)
+    out, roughness = measures = np.full((2, *p.shape), np.nan, np.float32)
+    marked = reasons.copy()
+    regions.mark_off_surface(
+        p, sigma, found.node, found.label, found.kind, np.ones(p.shape, bool), 2, 6, 2.0, 1.5, np.uint16(2), marked,
+        measures,
+    )  # fmt: skip
+    np.testing.assert_array_equal(marked == 2, (reasons == 0) & ~((out <= 2.0) & (roughness <= 1.5)))
     seen = 0
     for i, j in np.ndindex(*p.shape):
         want, want_roughness = slow.local_distance(p, sigma, label, 2, 6, i, j)

@@ -50,7 +50,7 @@ def test_a_thread_does_what_the_loops_do(fmt, periods, steps, brightness):
     way = fast.way_of(view, rig, S)
     height, width = way.frames[0].shape
     want = empty(height, width)
-    fast.by_bands(way, tuple(want))
+    fast.on_cpu(way, tuple(want))
     got = by_loops(way)
     lit = ((want[4] | got[4]) & DARK) == 0
     assert ((want[4] != got[4]) & lit).mean() <= 0.001

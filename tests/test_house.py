@@ -28,7 +28,7 @@ DOCS = ROOT / "docs"
 # ------------------------------------------------------------------------------------------------ who may import whom
 
 DATA = {"types", "settings", "errors"}
-BOTTOM = DATA | {"geometry", "kernels"}
+BOTTOM = DATA | {"geometry", "kernels", "memory", "calm"}
 STAGES = {
     "patterns", "phase", "denoise", "triangulate", "fuse", "response", "guide", "calibrate", "evaluate", "compare",
     "watch", "examination", "report",
@@ -42,8 +42,10 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "settings": ({"errors"}, "data, no behaviour"),
     "threads": (set(), "rows on all cores: knows nothing of what the rows hold"),
     "gpu": ({"threads"}, "slabs of rows through a GPU: knows nothing of what the rows hold"),
+    "memory": (set(), "large arrays used again: knows nothing of what they hold"),
     "kernels": ({"threads"}, "arrays in, arrays out: they know no dataclass, file or device"),
     "geometry": (DATA | {"kernels"}, "poses and lenses on top of the lens kernels"),
+    "calm": (DATA | {"kernels", "threads", "memory"}, "tiles of an image that need no closer look, for any stage"),
     **dict.fromkeys(STAGES, (BOTTOM, "stages never import each other: what passes between them is a type")),
     "twin": (DATA | {"threads"}, "the judge shares no maths with the judged"),
     "devices": (DATA, "a device knows what it is asked, not who asks"),

@@ -14,7 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from fringescope import geometry
+from fringescope import calm, geometry, memory
 from fringescope.kernels import regions as k
 from fringescope.kernels import screens
 from fringescope.settings import DenoiseSettings
@@ -33,8 +33,23 @@ from fringescope.types import (
     WrappedSet,
 )
 
-CALM = 3.5  #: sigmas; pixels that lie, as all around them, nearer to the local surface need no slower look
+NEAR, WIDE = 3.5, 4.6  #: sigmas; pixels that lie nearer to the local surface, and all around them, need no slower look
 TELLING = 0.5  #: least share of the best direction's sensitivity to depth that a direction needs to be judged by
+
+
+class Tiles:
+    """How much the phase of each direction of a view steps within each tile of pixels; measured when first asked."""
+
+    def __init__(self, decoded: Decoded) -> None:
+        self._decoded = decoded
+        self._steps: dict[int, F32] = {}
+
+    def steps(self, d: Direction) -> F32:
+        """See `calm.steps_of`; `d` must be one of the view's."""
+        key = next(n for n, one in enumerate(self._decoded.directions) if one is d)
+        if key not in self._steps:
+            self._steps[key] = calm.steps_of(d.phase)
+        return self._steps[key]
 
 
 def exposed(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> U16:
@@ -93,7 +108,7 @@ def weak(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> tup
     return np.asarray(s.min_background * scale > A), np.asarray(low)
 
 
-def odd_stride(pixels: int, enough: int = 100_000) -> int:
+def odd_stride(pixels: int, enough: int = 50_000) -> int:
     """Every how many-th row and column is enough for a median: odd, so that every colour of a mosaic comes in."""
     return round(math.sqrt(pixels / enough)) | 1
 
@@ -140,21 +155,30 @@ def _between(length: int, nodes: int) -> F64:
     return np.asarray(np.clip(1.0 - np.abs(at[:, None] - np.arange(nodes)), 0.0, None))
 
 
-def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings) -> U16:
+def monotonic(decoded: Decoded, reasons: U16, rig: Rig, s: DenoiseSettings, tiles: Tiles | None = None) -> U16:
     """III-D 2: fringes that run backwards come mirrored, from the substrate (equation 17).
 
     On every surface that faces camera and projector the phase grows along the image of the projector's rays in one
     sense, which the rig predicts at each pixel. Neighbours vote, so that noise on flat phase marks nothing.
     """
-    out = reasons.copy()
+    out = calm.copy_of(reasons)
     H, W = decoded.shape
     reach = max(1, round(s.monotonic_reach * W / 684))
+    radius = int(s.monotonic_window) // 2
+    tiles = tiles or Tiles(decoded)
     for d in telling(decoded, rig):
         field = geometry.epipolar_field(rig, rig.camera(decoded.camera), d.g)
-        signs, back = np.empty((H, W), np.int8), np.empty((H, W), np.bool_)
-        k.gradient_signs(d.phase, d.sigma, out, field, reach, s.monotonic_sigma, signs)
-        k.majority_backward(signs, int(s.monotonic_window) // 2, s.monotonic_share, 4, back)
-        out[back & (out == 0)] |= np.uint16(Reason.REVERSED)
+        cover = calm.cover_of(out)
+        doubtful = ~calm.growing(tiles.steps(d), cover, field, (H, W), reach) & (cover != calm.VOID)
+        if not doubtful.any():
+            continue
+        signs, backward = memory.empty((H, W), np.int8), np.empty(doubtful.shape, np.bool_)
+        seen = calm.widened(doubtful, 2 * radius)
+        k.gradient_signs(d.phase, d.sigma, out, seen, field, reach, s.monotonic_sigma, signs, backward)
+        asked = calm.widened(backward, radius) & (cover != calm.VOID)
+        if asked.any():
+            bit = np.uint16(Reason.REVERSED)
+            k.mark_backward(signs, asked, radius, s.monotonic_share, 4, bit, out)
     return out
 
 
@@ -173,51 +197,69 @@ def telling(decoded: Decoded, rig: Rig | None) -> tuple[Direction, ...]:
     return tuple(d for d, w in zip(decoded.directions, weight, strict=True) if w >= TELLING * max(weight))
 
 
-def connected(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -> U16:
+def connected(
+    decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings, tiles: Tiles | None = None
+) -> U16:
     """III-D 3: neighbours whose phases differ by less than T1 form domains; domains of fewer than T2 pixels go.
 
     Pixels that continue too few of their neighbours stand on a jump and go first.
     """
-    out = reasons.copy()
+    out = calm.copy_of(reasons)
+    tiles = tiles or Tiles(decoded)
     for d in telling(decoded, rig):
         field = _slopes(d, reasons, decoded, rig)
-        loose = np.empty(decoded.shape, np.bool_)
-        k.loose_pixels(
-            d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, int(s.jump_links), loose
-        )
-        out[loose] |= np.uint16(Reason.JUMP)
-        label = np.empty(decoded.shape, np.int32)
-        sizes = k.domains(d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, label)
-        small = np.append(sizes < s.island_share * decoded.background.size, False)
-        out[small[label] & (label >= 0)] |= np.uint16(Reason.ISLAND)
+        cover = calm.cover_of(out)
+        asked = ~calm.linked(tiles.steps(d), cover, _least_step(field, s), around=1) & (cover != calm.VOID)
+        if asked.any():
+            before = calm.copy_of(out)
+            k.mark_loose(
+                d.phase, d.sigma, before, asked, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma,
+                int(s.jump_links), np.uint16(Reason.JUMP), out,
+            )  # fmt: skip
+        found = _domains(d, out, field, s, tiles)
+        found.mark_small(s.island_share * decoded.background.size, np.uint16(Reason.ISLAND), out)
     return out
 
 
-def local(decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings) -> U16:
+def local(
+    decoded: Decoded, reasons: U16, rig: Rig | None, s: DenoiseSettings, tiles: Tiles | None = None
+) -> U16:
     """The fourth test: a point's phase lies within some of its own sigmas of the surface of its neighbours."""
-    out = reasons.copy()
+    out = calm.copy_of(reasons)
+    tiles = tiles or Tiles(decoded)
     for d in telling(decoded, rig):
         for _ in range(int(s.local_rounds)):
             field = _slopes(d, out, decoded, rig)
-            label = np.empty(decoded.shape, np.int32)
-            k.domains(d.phase, d.sigma, out, field, s.jump_factor, s.jump_floor_rad, s.jump_sigma, label)
-            distance, roughness = np.empty(decoded.shape, np.float32), np.empty(decoded.shape, np.float32)
+            found = _domains(d, out, field, s, tiles)
             asked = _rough(d, out, field, s)
-            k.local_surface(
-                d.phase, d.sigma, label, asked, int(s.local_window) // 2, int(s.local_least), distance, roughness
-            )
-            bad = (out == 0) & ~((distance <= s.local_sigma) & (roughness <= s.local_roughness))
-            out[bad] |= np.uint16(Reason.NOT_LOCAL)
+            k.mark_off_surface(
+                d.phase, d.sigma, found.node, found.label, found.kind, asked, int(s.local_window) // 2,
+                int(s.local_least), s.local_sigma, s.local_roughness, np.uint16(Reason.NOT_LOCAL), out,
+                np.empty((2, 0, 0), np.float32),
+            )  # fmt: skip
     return out
+
+
+def _domains(d: Direction, reasons: U16, field: F64, s: DenoiseSettings, tiles: Tiles) -> calm.Domains:
+    return calm.domains(
+        d.phase, d.sigma, reasons, field, (s.jump_factor, s.jump_floor_rad, s.jump_sigma), tiles.steps(d),
+        _least_step(field, s),
+    )  # fmt: skip
+
+
+def _least_step(field: F64, s: DenoiseSettings) -> float:
+    """The least T1 anywhere in a view, radians, without what noise adds."""
+    return max(s.jump_factor * float(field[..., 2].min()), s.jump_floor_rad)
 
 
 def _rough(d: Direction, reasons: U16, field: F64, s: DenoiseSettings) -> Bool:
     """The pixels that have to be judged: those that a quick look does not find calm, if the window is the usual one."""
-    asked = np.ones(reasons.shape, np.bool_)
+    asked = memory.empty(reasons.shape, np.bool_)
     if int(s.local_window) == 5:
-        limit = min(CALM, 0.75 * s.local_sigma)
-        step = max(s.jump_factor * float(field[..., 2].min()), s.jump_floor_rad)
-        screens.rough_pixels(d.phase, d.sigma, reasons, step, limit, asked)
+        limits = min(NEAR, 0.75 * s.local_sigma), min(WIDE, s.local_sigma, 1.8 * s.local_roughness)
+        screens.rough_pixels(d.phase, d.sigma, reasons, _least_step(field, s), *limits, asked)
+    else:
+        asked[:] = True
     return asked
 
 

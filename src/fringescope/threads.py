@@ -12,8 +12,9 @@ from typing import Any
 from numba import njit
 
 WORKERS = max(1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 64))
-BLOCKS = 4 * WORKERS  #: more blocks than workers, so that none waits long for another
-SMALL = 8  #: fewer rows than this run in one piece
+BLOCKS = 8 * WORKERS  #: more blocks than workers, so that none waits long for another
+SMALL = 8  #: fewer rows than this run in one piece,
+LITTLE = 1 << 16  #: and arrays of fewer elements: other threads would only be waited for
 
 
 @functools.cache
@@ -34,7 +35,7 @@ def by_rows(count: Callable[..., int]) -> Callable[[Callable[..., None]], Callab
         @functools.wraps(f)
         def call(*args: Any) -> None:
             n = count(*args)
-            if n < SMALL or WORKERS == 1:
+            if n < SMALL or WORKERS == 1 or max(getattr(a, "size", 0) for a in args) < LITTLE:
                 compiled(0, n, *args)
                 return
             edges = [n * b // BLOCKS for b in range(BLOCKS + 1)]

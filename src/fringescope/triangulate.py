@@ -62,15 +62,11 @@ def grid(
     rays.mark_outside(
         xyz, projector.pose.R, projector.pose.t, geometry.lens_vector(projector.lens), *field, *box, out, bit
     )
-    bad = out != 0
-    xyz[bad] = np.nan
-    sigma_mm[bad] = np.nan
+    rays.blank(xyz, sigma_mm, out)
     return Grid(rig.index(decoded.camera), decoded.camera, xyz, sigma_mm, out)
 
 
 def blanked(xyz: F32, sigma: F32, reasons: U16, rig: Rig, camera: str) -> Grid:
     """Points (H, W, 3) and sigma (H, W) that were made of all pixels, without those that have a reason (in place)."""
-    bad = reasons != 0
-    xyz[bad] = np.nan
-    sigma[bad] = np.nan
+    rays.blank(xyz, sigma, reasons)
     return Grid(rig.index(camera), camera, xyz, sigma, reasons)

@@ -183,18 +183,18 @@ def _chain(phases, sigmas, freq, i, j, first, order):
     how many standard deviations the next order of that set would fit worse.
     """
     absolute = phases[first, i, j] / TWO_PI + order
-    sigma = sigmas[first, i, j] / TWO_PI
+    variance = (sigmas[first, i, j] / TWO_PI) ** 2
     last = first
     chi2 = 0.0
     margin2 = np.inf
     for k in range(first + 1, phases.shape[0]):
         if not sigmas[k, i, j] < np.inf:
             continue
-        fine = sigmas[k, i, j] / TWO_PI
-        absolute, rest, margin = follow(absolute, sigma, phases[k, i, j] / TWO_PI, fine, freq[k] / freq[last])
+        fine = (sigmas[k, i, j] / TWO_PI) ** 2
+        absolute, rest, margin = follow(absolute, variance, phases[k, i, j] / TWO_PI, fine, freq[k] / freq[last])
         chi2 += rest
         margin2 = min(margin2, margin)
-        sigma = fine
+        variance = fine
         last = k
     return absolute, chi2, margin2
 
@@ -274,88 +274,6 @@ def unwrap(first, last, phases, sigmas, freq, bounds, unexpected, gray, gray_hal
             out[i, j], margin[i, j] = best_order(
                 phases, sigmas, freq, i, j, lo, hi, elo, ehi, unexpected, middle, gray_half, gray_soft
             )
-
-
-@by_rows(lambda phase, *_: phase.shape[0])
-def order_votes(first, last, phase, voters, asked, radius, least, majority, max_slope, out, changed):
-    """Let the neighbours vote on the order of each pixel that is `asked`: `out` = phase + 2 pi (elected order - own).
-
-    Each of the `voters` (a phase image, NaN = does not vote) votes for the order that brings this pixel nearest to
-    it, if the wrapped difference is below `max_slope` times the distance. The own order stays unless another, at most
-    8 away, holds `majority` of at least `least` votes. `changed` (int8) gets the elected change of order, 127 where
-    the majority confirms the own order, -128 where no order has the majority, 0 where too few voted; it stays what it
-    was where nobody asked.
-    """
-    H, W = phase.shape
-    counts = np.zeros(17, np.int64)
-    for i in range(first, last):
-        for j in range(W):
-            p = phase[i, j]
-            out[i, j] = p
-            if not asked[i, j]:
-                continue
-            changed[i, j] = 0
-            if p != p:
-                continue
-            votes = own = 0
-            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-                for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                    q = voters[y, x]
-                    if (y == i and x == j) or q != q:
-                        continue
-                    limit = max_slope * max(abs(y - i), abs(x - j))
-                    if abs(q - p) < math.pi:
-                        if abs(q - p) <= limit:
-                            votes += 1
-                            own += 1
-                        continue
-                    turns = math.floor((q - p) / TWO_PI + 0.5)
-                    if abs(q - p - TWO_PI * turns) > limit:
-                        continue
-                    votes += 1
-                    if turns >= -8 and turns <= 8:
-                        counts[int(turns) + 8] += 1
-            if own == votes:
-                if votes >= least:
-                    changed[i, j] = 127
-                continue
-            if votes < least:
-                counts[:] = 0
-                continue
-            counts[8] += own
-            top = 8
-            for t in range(17):
-                if counts[t] > counts[top]:
-                    top = t
-            if top != 8 and counts[top] >= majority * votes:
-                out[i, j] = p + TWO_PI * (top - 8)
-                changed[i, j] = top - 8
-            elif top == 8 and counts[8] >= majority * votes:
-                changed[i, j] = 127
-            elif counts[8] < (1.0 - majority) * votes:
-                changed[i, j] = -128
-            counts[:] = 0
-
-
-@by_rows(lambda phase, *_: phase.shape[0])
-def voters(first, last, phase, sigma, most, out):
-    """The phases that may vote: finite and of a sigma below `most`; NaN elsewhere."""
-    for i in range(first, last):
-        for j in range(phase.shape[1]):
-            out[i, j] = phase[i, j] if sigma[i, j] < most else np.nan
-
-
-@by_rows(lambda reasons, *_: reasons.shape[0])
-def weigh_reasons(first, last, reasons, uncertain, bit, weak, dark, inconsistent, out):
-    """Reasons with the bit of an uncertain order, but for what is `weak`; `dark` outweighs `inconsistent`."""
-    for i in range(first, last):
-        for j in range(reasons.shape[1]):
-            r = reasons[i, j] & ~bit
-            if uncertain[i, j] and (r & weak) == 0:
-                r |= bit
-            if r & dark:
-                r &= ~inconsistent
-            out[i, j] = r
 
 
 @by_rows(lambda frame, *_: frame.shape[0])

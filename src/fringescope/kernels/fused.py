@@ -14,8 +14,10 @@ from numba import njit
 
 from fringescope.kernels.depths import mark_outside, points, row_cubics
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
-from fringescope.kernels.pixel import TWO_PI, fitted, judged, weighed
-from fringescope.kernels.sinusoid import ROUNDING, follow, phase_variance
+from fringescope.kernels.pixel import TWO_PI, fitted, judged, of_eight, of_four, of_three, weighed
+from fringescope.kernels.raw import samples_at
+from fringescope.kernels.sinusoid import ROUNDING, follow, left_over
+from fringescope.threads import by_rows
 
 BLOCK = 512  #: pixels of a row that are worked on together
 
@@ -25,6 +27,7 @@ _INF = np.float32(np.inf)
 _NAN = np.float32(np.nan)
 _P, _Q, _S = BLOCK, 2 * BLOCK, 3 * BLOCK  # where the sums of I cos, I sin and I^2 lie in their scratch
 _CONTRACT = {"contract"}
+_FAR = np.int32(1 << 30)
 
 
 class Sets(NamedTuple):
@@ -35,6 +38,7 @@ class Sets(NamedTuple):
     sin: np.ndarray
     ratio: np.ndarray  #: (K,) float32, frequency over that of the set before; of the first: 1
     frequency: np.ndarray  #: (K,) float64
+    plain: np.ndarray  #: (K,) bool: the sine counts forward
     top: int  #: code of a saturated sample
     pivot: np.float32  #: taken off every sample, so that sums of squares keep their digits
 
@@ -65,7 +69,10 @@ class Limits(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def _sums(x, first, last, cos, sin, pivot, n, acc):
-    """Sums of I, I cos, I sin and I^2 of frames first..last-1 of a block `x` (F, BLOCK) into `acc` (4 BLOCK,)."""
+    """Sums of I, I cos, I sin and squared residuals of frames first..last-1 of a block `x` (F, BLOCK), into `acc`.
+
+    Samples count from `pivot` on.
+    """
     for j in range(n):
         acc[j] = _ZERO
         acc[_P + j] = _ZERO
@@ -93,63 +100,109 @@ def _sums(x, first, last, cos, sin, pivot, n, acc):
             acc[_Q + j] += a * sa
             acc[_S + j] += a * a
         f += 1
+    mean, gain = _ONE / _f(last - first), _TWO / _f(last - first)
+    for j in range(n):
+        t, p, q = acc[j], acc[_P + j], acc[_Q + j]
+        acc[_S + j] = left_over(acc[_S + j], t, p, q, t * mean, p * gain, q * gain, _ONE)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _fit(acc, steps, noise_a, noise_b, pivot, n, phase, sigma, background, modulation, rough):
-    """Sums to wrapped phase and sigma, turns, A and B, and the square of misfit over noise, added up by maximum."""
+def _four(x, first, n, acc):
+    """As `_sums` for four steps, by differences: no sum of squares, but that of the residuals, which is one square."""
+    xa, xb, xc, xd = x[first], x[first + 1], x[first + 2], x[first + 3]
+    total, in_phase, quadrature, rest = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
+    for j in range(n):
+        a, b, c, d = _f(xa[j]), _f(xb[j]), _f(xc[j]), _f(xd[j])
+        t, p, q, r = of_four(a, b, c, d)
+        total[j] = t
+        in_phase[j] = p
+        quadrature[j] = q
+        rest[j] = r
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _eight(x, first, n, acc):
+    """As `_four`, for eight steps: the residuals are the second, third and fourth harmonics of the samples."""
+    x0, x1, x2, x3 = x[first], x[first + 1], x[first + 2], x[first + 3]
+    x4, x5, x6, x7 = x[first + 4], x[first + 5], x[first + 6], x[first + 7]
+    total, in_phase, quadrature, rest = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
+    for j in range(n):
+        a, b, c, d = _f(x0[j]), _f(x1[j]), _f(x2[j]), _f(x3[j])
+        e, f, g, h = _f(x4[j]), _f(x5[j]), _f(x6[j]), _f(x7[j])
+        t, p, q, r = of_eight(a, b, c, d, e, f, g, h)
+        total[j] = t
+        in_phase[j] = p
+        quadrature[j] = q
+        rest[j] = r
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _fit(acc, steps, noise_a, noise_b, misfit2, pivot, n, phase, variance, background, modulation, rough):
+    """Sums to wrapped phase and its variance, turns, A and B; `rough` grows above 0 where a set misses its sinusoid.
+
+    That is where the variance of the samples about it exceeds `misfit2` times that of the noise.
+    """
     mean, gain = _ONE / _f(steps), _TWO / _f(steps)
     share = _ONE / _f(steps - 3) if steps > 3 else _ZERO
+    total, in_phase, quadrature, residuals = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
     for j in range(n):
-        wrapped, a, b, v, misfit = fitted(
-            acc[j], acc[_P + j], acc[_Q + j], acc[_S + j], mean, gain, share, noise_a, noise_b, pivot
+        wrapped, a, b, v, off = fitted(
+            total[j], in_phase[j], quadrature[j], residuals[j], mean, gain, share, noise_a, noise_b, misfit2, pivot
         )
+        worst = rough[j]
         phase[j] = wrapped
         background[j] = a
         modulation[j] = b
-        sigma[j] = v
-        rough[j] = max(rough[j], misfit)
+        rough[j] = off if off > worst else worst
+        variance[j] = v
     if steps == 3:
         for j in range(n):
-            b = modulation[j]
-            c = acc[_P + j] * gain / b
-            sigma[j] = math.sqrt(max(phase_variance(sigma[j], noise_b, b, c, gain, 3), _ZERO)) / TWO_PI
-    else:
-        for j in range(n):
-            sigma[j] = math.sqrt(phase_variance(sigma[j], noise_b, modulation[j], _ONE, gain, 4)) / TWO_PI
+            variance[j] = of_three(in_phase[j], background[j], modulation[j], gain, noise_a, noise_b)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _ramp(nodes, width, col, n, out):
-    """Values of a row of nodes that spans a picture of `width` pixels corner on corner, at columns col..col+n-1."""
-    last = len(nodes) - 1
-    scale = last / max(width - 1, 1)
+def _ramp(nodes, scale, col, n, out):
+    """Values between nodes that lie 1 / `scale` columns apart, the first at column 0, at columns col..col+n-1."""
+    last = len(nodes) - 2
     j = 0
     while j < n:
-        k = min(int((col + j) * scale), last - 1)
-        end = n if k == last - 1 else min(n, math.ceil((k + 1) / scale) - col)
+        k = min(int((col + j) * scale), last)
+        end = n if k == last else min(n, int((k + 1) / scale) + 1 - col)
         end = max(end, j + 1)
-        slope = _f((nodes[k + 1] - nodes[k]) * scale)
-        begin = _f(nodes[k] + (nodes[k + 1] - nodes[k]) * ((col + j) * scale - k))
+        slope = (nodes[k + 1] - nodes[k]) * scale
+        begin, step = _f(nodes[k] + slope * (col + j - k / scale)), _f(slope)
+        target = out[j:end]
         for i in range(end - j):
-            out[j + i] = begin + slope * _f(i)
+            target[i] = begin + step * _f(i)
         j = end
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _wide_sigma(sigma, systematic, n, out):
+def _start(phase, order, n, absolute, chi2, margin2):
     for j in range(n):
-        out[j] = math.sqrt(sigma[j] * sigma[j] + systematic * systematic)
+        absolute[j] = phase[j] + order
+        chi2[j] = _ZERO
+        margin2[j] = _INF
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _step(absolute, carried, phase, sigma, ratio, n, chi2, margin2):
+def _step(coarse, phase, fine, systematic2, ratio, n, absolute, chi2, margin2):
+    """One set finer; `coarse` and `fine` are the variances of both sets' phases, which share a systematic error."""
     for j in range(n):
-        a, rest, m = follow(absolute[j], carried[j], phase[j], sigma[j], ratio)
+        a, rest, m = follow(absolute[j], coarse[j] + systematic2, phase[j], fine[j] + systematic2, ratio)
         absolute[j] = a
-        carried[j] = sigma[j]
         chi2[j] += rest
-        margin2[j] = min(margin2[j], m)
+        least = margin2[j]
+        margin2[j] = m if m < least else least
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _accept(absolute, bounds, n, best):
+    """The one order that comes into question, where it lies in the bounds."""
+    lo, hi = bounds[0], bounds[1]
+    for j in range(n):
+        a = absolute[j]
+        best[j] = a if (a >= lo[j]) & (a <= hi[j]) else _NAN
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -167,26 +220,37 @@ def _consider(absolute, chi2, margin2, bounds, unexpected, n, best, best_chi2, s
         best_margin2[j] = margin
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _candidates(phase, lo, hi, up, slack, n):
-    """First and last order of the coarsest set that any pixel of the block may have; none: last < first."""
-    first, last = 1 << 30, -(1 << 30)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _margin(best_chi2, second, best_margin2, n, margin2):
     for j in range(n):
-        if lo[j] <= hi[j]:
-            first = min(first, math.ceil(lo[j] / up - phase[j] - slack))
-            last = max(last, math.floor(hi[j] / up - phase[j] + slack))
+        apart, m = second[j] - best_chi2[j], best_margin2[j]
+        margin2[j] = apart if apart < m else m
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _candidates(phase, lo, hi, per_turn, slack, n):
+    """First and last order of the coarsest set that any pixel of the block may have; none: last < first."""
+    first, last = _FAR, -_FAR
+    for j in range(n):
+        some = lo[j] <= hi[j]
+        a = np.int32(np.ceil(lo[j] * per_turn - phase[j] - slack))
+        b = np.int32(np.floor(hi[j] * per_turn - phase[j] + slack))
+        a, b = a if some else _FAR, b if some else -_FAR
+        first = a if a < first else first
+        last = b if b > last else last
     return first, last
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _judge(sigma, background, modulation, coarse_modulation, rough, usual, absolute, best_chi2, second, margin2, limits,
-           n, reasons):  # fmt: skip
-    """Reason bits of unsaturated pixels: exposure (III-D 1), order, consistency."""
+def _judge(variance, background, modulation, coarse_modulation, rough, usual, absolute, margin2, limits, n, sigma,
+           reasons):  # fmt: skip
+    """Reason bits of unsaturated pixels: exposure (III-D 1), order, consistency; and sigma, turns, from its square."""
     for j in range(n):
+        s = math.sqrt(variance[j])
+        sigma[j] = s
         reasons[j] = judged(
-            background[j], modulation[j], coarse_modulation[j], sigma[j], rough[j], usual[j], absolute[j],
-            best_chi2[j], second[j], margin2[j], limits,
-        )  # fmt: skip
+            background[j], modulation[j], coarse_modulation[j], s, rough[j], usual[j], absolute[j], margin2[j], limits
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -273,25 +337,25 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
     return reasons, best / turn, own / turn, a, b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def decode(first, last, frames, row0, height, sets, limits, bounds, usual, depths,
+@by_rows(lambda _addresses, _bytes, _like, _sets, _limits, _bounds, _usual, _depths, phase, *_: phase.shape[0])
+def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual, depths,
            phase, sigma, background, modulation, reasons, xyz, sigma_mm):  # fmt: skip
-    """Rows first..last-1 of a band of raw frames (F, h, W), whose row 0 is row `row0` of a picture of `height` rows.
+    """Raw frames to points: the rows of frame f lie `row_bytes[f]` apart in memory, from `addresses[f]` on, as samples
+    of the type of the array `like`.
 
-    Writes the rows of the outputs, which are bands as well: absolute phase of the finest set and its sigma, radians;
-    A and B, codes; reason bits; world points, mm, and their sigma along the ray. `bounds` (4, h', w') and `usual`
-    (h'', w'') span the picture corner on corner: orders' bounds in turns, the usual contrast of the finest set over
-    that of the next coarser one.
+    Writes (H, W) absolute phase of the finest set and its sigma, radians; A and B, codes; reason bits; world points,
+    mm, and their sigma along the ray. `bounds` (4, h', w') and `usual` (h'', w'') span the picture corner on corner:
+    orders' bounds in turns, the usual contrast of the finest set over that of the next coarser one.
     """
-    F, _, W = frames.shape
-    K = len(sets.frequency)
-    x = np.empty((F, BLOCK), frames.dtype)
-    top = np.empty(BLOCK, frames.dtype)
+    F, K = len(addresses), len(sets.frequency)
+    height, W = phase.shape
+    x = np.empty((F, BLOCK), like.dtype)
+    top = np.empty(BLOCK, like.dtype)
     acc = np.empty(4 * BLOCK, np.float32)
     wrapped, own = np.empty((K, BLOCK), np.float32), np.empty((K, BLOCK), np.float32)
-    wide, mod = np.empty((K, BLOCK), np.float32), np.empty((K, BLOCK), np.float32)
+    mod = np.empty((K, BLOCK), np.float32)
     limit = np.empty((4, BLOCK), np.float32)
-    absolute, carried, chi2, margin2, best, best_chi2, second, best_margin2, rough, back, around = (
+    absolute, chi2, margin2, best, best_chi2, second, best_margin2, rough, back, around, fine = (
         np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
         np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
         np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
@@ -302,21 +366,26 @@ def decode(first, last, frames, row0, height, sets, limits, bounds, usual, depth
     used = np.empty((K, 2), np.uint64)
     limit_row = np.empty((4, bounds.shape[2]), np.float64)
     usual_row = np.empty(usual.shape[1], np.float64)
+    limit_scale, usual_scale = (bounds.shape[2] - 1) / max(W - 1, 1), (usual.shape[1] - 1) / max(W - 1, 1)
     row = np.empty(depths.table.shape[1], np.float32)
     X, Y, Z = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    up = _f(sets.frequency[K - 1] / sets.frequency[0])
+    systematic2 = limits.systematic * limits.systematic
+    per_turn = _f(sets.frequency[0] / sets.frequency[K - 1])
     slack = _ZERO
     for k in range(1, K):
         slack += _f(sets.frequency[0] / sets.frequency[k])
     slack = _HALF * slack + _f(0.01)
     for i in range(first, last):
-        rows_between(bounds, row0 + i, height, limit_row)
-        row_between(usual, row0 + i, height, usual_row)
-        row_cubics(depths.table, row0 + i, depths.step, row)
+        rows_between(bounds, i, height, limit_row)
+        row_between(usual, i, height, usual_row)
+        row_cubics(depths.table, i, depths.step, row)
         for col in range(0, W, BLOCK):
             n = min(BLOCK, W - col)
             for f in range(F):
-                x[f, :n] = frames[f, i, col : col + n]
+                source = samples_at(addresses[f] + i * row_bytes[f] + col * like.itemsize, n, like)
+                target = x[f]
+                for j in range(n):
+                    target[j] = source[j]
             for j in range(n):
                 top[j] = x[0, j]
                 rough[j] = _ZERO
@@ -324,44 +393,67 @@ def decode(first, last, frames, row0, height, sets, limits, bounds, usual, depth
                 target = x[f]
                 for j in range(n):
                     top[j] = max(top[j], target[j])
+            brightest = top[0]
+            for j in range(n):
+                brightest = max(brightest, top[j])
             for k in range(K):
                 a, b = sets.start[k], sets.start[k + 1]
-                _sums(x, a, b, sets.cos, sets.sin, sets.pivot, n, acc)
-                _fit(acc, b - a, limits.noise_a, limits.noise_b, sets.pivot, n, wrapped[k], own[k], back, mod[k], rough)
-                _wide_sigma(own[k], limits.systematic, n, wide[k])
-            for m in range(4):
-                _ramp(limit_row[m], W, col, n, limit[m])
-            _ramp(usual_row, W, col, n, around)
-            for j in range(n):
-                best[j] = _NAN
-                best_chi2[j] = second[j] = best_margin2[j] = _INF
-            low, high = _candidates(wrapped[0], limit[0], limit[1], up, slack, n)
-            for order in range(low, high + 1):
+                pivot = sets.pivot
+                if b - a == 4 and sets.plain[k]:
+                    _four(x, a, n, acc)
+                    pivot = _ZERO
+                elif b - a == 8 and sets.plain[k]:
+                    _eight(x, a, n, acc)
+                    pivot = _ZERO
+                else:
+                    _sums(x, a, b, sets.cos, sets.sin, pivot, n, acc)
+                _fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k], back,
+                     mod[k], rough)  # fmt: skip
+            for m in range(2):
+                _ramp(limit_row[m], limit_scale, col, n, limit[m])
+            _ramp(usual_row, usual_scale, col, n, around)
+            low, high = _candidates(wrapped[0], limit[0], limit[1], per_turn, slack, n)
+            if low != high or brightest >= sets.top:
+                for m in range(2, 4):
+                    _ramp(limit_row[m], limit_scale, col, n, limit[m])
+            if low != high:
                 for j in range(n):
-                    absolute[j] = wrapped[0, j] + _f(order)
-                    carried[j] = wide[0, j]
-                    chi2[j] = _ZERO
-                    margin2[j] = _INF
+                    best[j] = _NAN
+                    best_chi2[j] = second[j] = best_margin2[j] = _INF
+            for order in range(low, high + 1):
+                _start(wrapped[0], _f(order), n, absolute, chi2, margin2)
                 for k in range(1, K):
-                    _step(absolute, carried, wrapped[k], wide[k], sets.ratio[k], n, chi2, margin2)
-                _consider(absolute, chi2, margin2, limit, limits.unexpected, n, best, best_chi2, second, best_margin2)
-            _judge(own[K - 1], back, mod[K - 1], mod[max(K - 2, 0)], rough, around, best, best_chi2, second,
-                   best_margin2, limits, n, bits)  # fmt: skip
-            for j in range(n):
+                    _step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
+                if low == high:
+                    _accept(absolute, limit, n, best)
+                else:
+                    _consider(absolute, chi2, margin2, limit, limits.unexpected, n, best, best_chi2, second,
+                              best_margin2)  # fmt: skip
+            if low != high:
+                _margin(best_chi2, second, best_margin2, n, margin2)
+            b = mod[K - 1]
+            _judge(own[K - 1], back, b, mod[max(K - 2, 0)], rough, around, best, margin2, limits, n, fine, bits)
+            for j in range(n if brightest >= sets.top else 0):
                 if top[j] >= sets.top:
-                    bits[j], best[j], own[K - 1, j], back[j], mod[K - 1, j] = clipped_pixel(
+                    bits[j], best[j], fine[j], back[j], b[j] = clipped_pixel(
                         x, j, sets, limits, limit, one[0], one[1], one[2], one[3], used
                     )
-            points(best, own[K - 1], row, depths, col, n, X, Y, Z, sigma_mm[i, col : col + n])
-            mark_outside(X, Y, Z, depths, n, bits, limits.outside, limits.uncertain)
-            point = xyz[i, col : col + n]
+            lost = ~limits.uncertain
             for j in range(n):
-                point[j, 0] = X[j]
-                point[j, 1] = Y[j]
-                point[j, 2] = Z[j]
+                lost = lost if bits[j] & ~limits.uncertain else np.uint16(0)
+            point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
+            if lost != 0:
+                for j in range(n):
+                    along[j] = point[j, 0] = point[j, 1] = point[j, 2] = _NAN
+            else:
+                points(best, fine, row, depths, col, n, X, Y, Z, along)
+                mark_outside(X, Y, Z, depths, n, bits, limits.outside, limits.uncertain)
+                for j in range(n):
+                    point[j, 0] = X[j]
+                    point[j, 1] = Y[j]
+                    point[j, 2] = Z[j]
             out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
             out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
-            fine, b = own[K - 1], mod[K - 1]
             for j in range(n):
                 out_phase[j] = TWO_PI * best[j]
                 out_sigma[j] = TWO_PI * fine[j]

@@ -14,8 +14,8 @@ from numba.extending import overload
 
 from fringescope.kernels.depths import FIELDS, Depths, cubics_of, row_cubics, space_of
 from fringescope.kernels.fused import Limits, Sets, clipped_pixel, row_between
-from fringescope.kernels.pixel import TWO_PI, fitted, is_inside, judged, point, weighed
-from fringescope.kernels.sinusoid import follow, phase_variance, whole
+from fringescope.kernels.pixel import TWO_PI, fitted, is_inside, judged, of_eight, of_four, of_three, point, weighed
+from fringescope.kernels.sinusoid import follow, left_over, whole
 
 MAX_SETS = 8  #: of a view: what a thread has room for
 MAX_FRAMES = 128
@@ -90,7 +90,7 @@ def _between(nodes, k, t):
 
 @njit(cache=True, error_model="numpy")
 def _sums(frames, i, j, first, last, cos, sin, pivot):
-    """Sums of I, I cos, I sin and I^2 of frames first..last-1, four by four as on the processor."""
+    """Sums of I, I cos, I sin and squared residuals of frames first..last-1, four by four as on the processor."""
     t = p = q = squares = _ZERO
     f = first
     while f + 4 <= last:
@@ -108,7 +108,8 @@ def _sums(frames, i, j, first, last, cos, sin, pivot):
         q += a * sin[f]
         squares += a * a
         f += 1
-    return t, p, q, squares
+    mean, gain = _ONE / _f(last - first), _TWO / _f(last - first)
+    return t, p, q, left_over(squares, t, p, q, t * mean, p * gain, q * gain, _ONE)
 
 
 @njit(cache=True, error_model="numpy")
@@ -136,10 +137,10 @@ def _finish(band, i, j, depths, cubics, turn, own, a, b, reasons, limits):
 
 
 @njit(cache=True, error_model="numpy")
-def decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide):
+def decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, variance):
     """Pixel (i, j) of a band from samples to its point; one with saturated samples is marked and left.
 
-    `wrapped`, `wide` (MAX_SETS,) are scratch.
+    `wrapped`, `variance` (MAX_SETS,) are scratch.
     """
     frames, row, K = band.frames, band.row0 + i, len(sets.frequency)
     top = frames[0, i, j]
@@ -149,22 +150,37 @@ def decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide):
         band.reasons[i, j] = CLIPPED
         return
     a = b = coarse_b = own = rough = slack = _ZERO
+    systematic2 = limits.systematic * limits.systematic
     for k in range(K):
         first, last = sets.start[k], sets.start[k + 1]
-        total, p, q, squares = _sums(frames, i, j, first, last, sets.cos, sets.sin, sets.pivot)
         steps = last - first
-        gain = _TWO / _f(steps)
+        pivot = sets.pivot
+        if steps == 4 and sets.plain[k]:
+            pivot = _ZERO
+            total, p, q, residuals = of_four(
+                _f(frames[first, i, j]), _f(frames[first + 1, i, j]), _f(frames[first + 2, i, j]),
+                _f(frames[first + 3, i, j]),
+            )  # fmt: skip
+        elif steps == 8 and sets.plain[k]:
+            pivot = _ZERO
+            total, p, q, residuals = of_eight(
+                _f(frames[first, i, j]), _f(frames[first + 1, i, j]), _f(frames[first + 2, i, j]),
+                _f(frames[first + 3, i, j]), _f(frames[first + 4, i, j]), _f(frames[first + 5, i, j]),
+                _f(frames[first + 6, i, j]), _f(frames[first + 7, i, j]),
+            )  # fmt: skip
+        else:
+            total, p, q, residuals = _sums(frames, i, j, first, last, sets.cos, sets.sin, pivot)
+        mean, gain = _ONE / _f(steps), _TWO / _f(steps)
         share = _ONE / _f(steps - 3) if steps > 3 else _ZERO
         coarse_b = b
-        w, a, b, v, misfit = fitted(
-            total, p, q, squares, _ONE / _f(steps), gain, share, limits.noise_a, limits.noise_b, sets.pivot
+        w, a, b, own, off = fitted(
+            total, p, q, residuals, mean, gain, share, limits.noise_a, limits.noise_b, limits.misfit, pivot
         )
-        rough = max(rough, misfit)
-        cos_phase = p * gain / b if steps == 3 else _ONE
-        variance = _f(phase_variance(v, limits.noise_b, b, cos_phase, gain, steps))
-        own = math.sqrt(_ZERO if variance < _ZERO else variance) / TWO_PI  # NaN stays NaN
+        rough = off if off > rough else rough
+        if steps == 3:
+            own = of_three(p, a, b, gain, limits.noise_a, limits.noise_b)
         wrapped[k] = w
-        wide[k] = math.sqrt(own * own + limits.systematic * limits.systematic)
+        variance[k] = own + systematic2
         slack += _f(sets.frequency[0] / sets.frequency[k]) if k > 0 else _ZERO
     coarse_b = coarse_b if K > 1 else b
     W = frames.shape[2]
@@ -173,23 +189,24 @@ def decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide):
     soft_lo, soft_hi = _between(rows.bounds[2, row], at, t), _between(rows.bounds[3, row], at, t)
     best, best_chi2, second, best_margin2 = _NAN, _INF, _INF, _INF
     if lo <= hi:
-        up = _f(sets.frequency[K - 1] / sets.frequency[0])
+        per_turn = _f(sets.frequency[0] / sets.frequency[K - 1])
         slack = _HALF * slack + _f(0.01)
-        low, high = math.ceil(lo / up - wrapped[0] - slack), math.floor(hi / up - wrapped[0] + slack)
+        low, high = math.ceil(lo * per_turn - wrapped[0] - slack), math.floor(hi * per_turn - wrapped[0] + slack)
         for order in range(low, high + 1):
-            absolute, carried, chi2, margin2 = wrapped[0] + _f(order), wide[0], _ZERO, _INF
+            absolute, chi2, margin2 = wrapped[0] + _f(order), _ZERO, _INF
             for k in range(1, K):
-                absolute, rest, margin = follow(absolute, carried, wrapped[k], wide[k], sets.ratio[k])
-                carried = wide[k]
+                absolute, rest, margin = follow(absolute, variance[k - 1], wrapped[k], variance[k], sets.ratio[k])
                 chi2 += rest
-                margin2 = min(margin2, margin)
+                margin2 = margin if margin < margin2 else margin2
             best, best_chi2, second, best_margin2 = weighed(
                 absolute, chi2, margin2, lo, hi, soft_lo, soft_hi, limits.unexpected,
                 best, best_chi2, second, best_margin2,
             )  # fmt: skip
     at, t = _place(j, W, rows.usual.shape[1])
     usual = _between(rows.usual[row], at, t)
-    reasons = judged(a, b, coarse_b, own, rough, usual, best, best_chi2, second, best_margin2, limits)
+    apart, own = second - best_chi2, math.sqrt(own)
+    margin2 = apart if apart < best_margin2 else best_margin2
+    reasons = judged(a, b, coarse_b, own, rough, usual, best, margin2, limits)
     _finish(band, i, j, depths, rows.cubics[row], best, own, a, b, reasons, limits)
 
 
@@ -224,9 +241,9 @@ def _rows(height, depths, nodes, out):
 def _decode(band, sets, limits, rows, depths):
     i, j = cuda.blockIdx.y, cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     wrapped = cuda.local.array(MAX_SETS, np.float32)
-    wide = cuda.local.array(MAX_SETS, np.float32)
+    variance = cuda.local.array(MAX_SETS, np.float32)
     if i < band.frames.shape[1] and j < band.frames.shape[2]:
-        decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, wide)
+        decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, variance)
 
 
 @cuda.jit(cache=True)

@@ -9,27 +9,61 @@ import numpy as np
 from numba import njit
 
 from fringescope.kernels.lens import to_plane
-from fringescope.kernels.sinusoid import ROUNDING, left_over, turns
+from fringescope.kernels.sinusoid import ROUNDING, phase_variance, turns
 
 TWO_PI = np.float32(2 * math.pi)
 
 _f = np.float32
 _ZERO, _ONE, _TWO, _THREE = (np.float32(c) for c in (0.0, 1.0, 2.0, 3.0))
 _INF = np.float32(np.inf)
+_HALF_ROOT = np.float32(math.sqrt(0.5))
+_PER_TURN2 = np.float32(1.0 / (4.0 * math.pi**2))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def fitted(t, p, q, squares, mean, gain, share, noise_a, noise_b, pivot):
-    """Sums of I, I cos, I sin, I^2 of a set to wrapped phase, A, B, variance of a sample, square of misfit over noise.
+def of_four(a, b, c, d):
+    """Sums of I, I cos, I sin and squared residuals of four samples, by differences."""
+    even, odd = a + c, b + d
+    off = even - odd
+    return even + odd, a - c, b - d, _f(0.25) * off * off
 
-    `mean`, `gain`, `share`: 1 / N, 2 / N, 1 / (N - 3); `pivot` has been taken off every sample.
+
+@njit(cache=True, inline="always", error_model="numpy")
+def of_eight(a, b, c, d, e, f, g, h):
+    """As `of_four`, of eight samples: the residuals are their second, third and fourth harmonics."""
+    s0, s1, s2, s3 = a + e, b + f, c + g, d + h
+    d0, d1, d2, d3 = a - e, b - f, c - g, d - h
+    even, odd = s0 + s2, s1 + s3
+    u, v = _HALF_ROOT * (d1 - d3), _HALF_ROOT * (d1 + d3)
+    c2, q2, c3, q3, c4 = s0 - s2, s1 - s3, d0 - u, v - d2, even - odd
+    rest = _f(0.25) * ((c2 * c2 + q2 * q2) + (c3 * c3 + q3 * q3)) + _f(0.125) * c4 * c4
+    return even + odd, d0 + u, d2 + v, rest
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def fitted(t, p, q, residuals, mean, gain, share, noise_a, noise_b, misfit2, pivot):
+    """Sums of I, I cos, I sin and squared residuals of a set to wrapped phase, A, B, the phase's variance in turns, and
+    by how much the variance of the samples about the sinusoid exceeds `misfit2` times that of the noise.
+
+    `mean`, `gain`, `share`: 1 / N, 2 / N, 1 / (N - 3); `pivot` has been taken off every sample. Three steps have a
+    variance of their own: see `of_three`.
     """
     a, c, s = t * mean, p * gain, q * gain
     b = math.sqrt(c * c + s * s)
-    rest = left_over(squares, t, p, q, a, c, s, share)
     a += pivot
-    v = max(noise_a + noise_b * a, _f(ROUNDING))
-    return turns(s, c), a, b, v, rest / v
+    v = noise_a + noise_b * a
+    v = v if v > _f(ROUNDING) else _f(ROUNDING)
+    own = phase_variance(v, _ZERO, b, _ONE, gain, 4) * _PER_TURN2
+    return turns(s, c), a, b, own, residuals * share - misfit2 * v
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def of_three(p, a, b, gain, noise_a, noise_b):
+    """Variance of the phase of three steps, turns; `p` is the sum of I cos. NaN where b is 0."""
+    v = noise_a + noise_b * a
+    v = v if v > _f(ROUNDING) else _f(ROUNDING)
+    v = phase_variance(v, noise_b, b, p * gain / b, gain, 3)
+    return (_ZERO if v < _ZERO else v) * _PER_TURN2
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -38,25 +72,28 @@ def weighed(a, chi2, margin2, lo, hi, soft_lo, soft_hi, unexpected, best, best_c
 
     An order outside lo .. hi does not count; outside soft_lo .. soft_hi it costs `unexpected`.
     """
-    cost = chi2 + (unexpected if a < soft_lo or a > soft_hi else _ZERO)
-    cost = cost if a >= lo and a <= hi else _INF
+    cost = chi2 + (unexpected if (a < soft_lo) | (a > soft_hi) else _ZERO)
+    cost = cost if (a >= lo) & (a <= hi) else _INF
     better = cost < best_chi2
-    second = best_chi2 if better else min(second, cost)
+    other = second if second < cost else cost
+    second = best_chi2 if better else other
     return a if better else best, cost if better else best_chi2, second, margin2 if better else best_margin2
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def judged(a, b, coarse_b, sigma, rough, usual, absolute, best_chi2, second, margin2, limits):
+def judged(a, b, coarse_b, sigma, rough, usual, absolute, margin2, limits):
     """Reason bits of an unsaturated pixel (`fused.Limits`): exposure (III-D 1), order, consistency."""
-    noise = math.sqrt(max(limits.noise_a + limits.noise_b * a, _f(ROUNDING)))
+    w = limits.noise_a + limits.noise_b * a
+    noise2 = w if w > _f(ROUNDING) else _f(ROUNDING)
     dark = a < limits.background
-    low = b < limits.modulation or b < limits.contrast * a or b < limits.modulation_sigma * noise
-    torn = rough > limits.misfit
-    fine = b / coarse_b * (_ONE + _TWO * TWO_PI * sigma) < limits.fine_modulation * usual
-    weak = sigma > limits.sigma or fine
-    low = low or (weak and not dark and not torn)
+    low = (b < limits.modulation) | (b < limits.contrast * a)
+    low = low | (b * b < limits.modulation_sigma * limits.modulation_sigma * noise2)
+    torn = rough > _ZERO
+    fine = b * (_ONE + _TWO * TWO_PI * sigma) < limits.fine_modulation * usual * coarse_b
+    weak = (sigma > limits.sigma) | fine
+    low = low | (weak & (not dark) & (not torn))
     none = absolute != absolute
-    certain = min(second - best_chi2, margin2) >= limits.margin
+    certain = margin2 >= limits.margin
     r = limits.dark if dark else 0
     r |= limits.low_modulation if low else 0
     r |= limits.inconsistent if torn else 0

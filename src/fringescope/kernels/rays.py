@@ -141,3 +141,21 @@ def mark_outside(first, last, xyz, R, t, lens, low, high, centre, axes, half_siz
                 inside = inside and abs(along) <= half_size[k]
             if not inside:
                 reasons[i, j] |= bit
+
+
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def blank(first, last, xyz, sigma, reasons):
+    """NaN in place of points (H, W, 3) and sigma (H, W) that have a reason."""
+    W = reasons.shape[1]
+    for i in range(first, last):
+        row, s, p = reasons[i], sigma[i], xyz[i]
+        for col in range(0, W, 64):
+            end = min(col + 64, W)
+            some = np.uint16(0)
+            for j in range(col, end):
+                some |= row[j]
+            if some == 0:
+                continue
+            for j in range(col, end):
+                if row[j] != 0:
+                    s[j] = p[j, 0] = p[j, 1] = p[j, 2] = np.nan

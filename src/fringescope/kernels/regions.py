@@ -5,194 +5,107 @@ import math
 import numpy as np
 from numba import njit
 
+from fringescope.kernels.domains import label_of
 from fringescope.kernels.lens import to_plane
+from fringescope.kernels.links import largest_step, linked, spread
+from fringescope.kernels.tiles import TILE
 from fringescope.threads import by_rows
 
-STRIP = 8  #: pixels of a row for which the predicted direction is taken at their first
 
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _spread(field, i, j, H, W, c):
-    """Channel c of a coarse field (h, w, C) that spans the image corner on corner, at pixel (i, j)."""
-    h, w = field.shape[0], field.shape[1]
-    y = i * (h - 1) / max(H - 1, 1)
-    x = j * (w - 1) / max(W - 1, 1)
-    y0 = min(int(y), max(h - 2, 0))
-    x0 = min(int(x), max(w - 2, 0))
-    y1 = min(y0 + 1, h - 1)
-    x1 = min(x0 + 1, w - 1)
-    fy = y - y0
-    fx = x - x0
-    return (1 - fy) * ((1 - fx) * field[y0, x0, c] + fx * field[y0, x1, c]) + fy * (
-        (1 - fx) * field[y1, x0, c] + fx * field[y1, x1, c]
-    )
-
-
-@by_rows(lambda phase, *_: phase.shape[0])
-def gradient_signs(first, last, phase, sigma, reasons, field, reach, significance, out):
+@by_rows(lambda _phase, _sigma, _reasons, asked, *_: asked.shape[0])
+def gradient_signs(first, last, phase, sigma, reasons, asked, field, reach, significance, out, backward):
     """Sign of the phase's growth along the predicted direction (equation 17): 1 forward, -1 backward, 0 unknown.
 
     `field` (h, w, 3) holds the unit direction (du, dv). The difference is taken over `reach` pixels on either side, or
-    on one where the other is masked; it must exceed `significance` standard deviations to count.
+    on one where the other is masked; it must exceed `significance` standard deviations to count. Only the pixels of
+    tiles that are `asked` (see `tiles.py`) are looked at; `backward` gets the tiles that have a sign of -1.
     """
     H, W = phase.shape
-    for i in range(first, last):
-        strip = -1
-        x = y = 0
-        for j in range(W):
-            out[i, j] = 0
-            if reasons[i, j] != 0:
+    for t in range(first, last):
+        for u in range(asked.shape[1]):
+            backward[t, u] = False
+            if not asked[t, u]:
                 continue
-            if j // STRIP != strip:  # the direction hardly turns within a strip
-                strip = j // STRIP
-                du, dv = _spread(field, i, strip * STRIP, H, W, 0), _spread(field, i, strip * STRIP, H, W, 1)
+            for i in range(t * TILE, min(t * TILE + TILE, H)):
+                # the direction hardly turns within a tile's row
+                du, dv = spread(field, i, u * TILE, H, W, 0), spread(field, i, u * TILE, H, W, 1)
                 n = math.hypot(du, dv)
                 x = round(reach * du / n) if n > 0.0 else 0
                 y = round(reach * dv / n) if n > 0.0 else 0
-            if x == 0 and y == 0:
-                continue
-            a, b = phase[i, j], phase[i, j]
-            va = vb = sigma[i, j] ** 2
-            if 0 <= i + y < H and 0 <= j + x < W and reasons[i + y, j + x] == 0:
-                a = phase[i + y, j + x]
-                va = sigma[i + y, j + x] ** 2
-            if 0 <= i - y < H and 0 <= j - x < W and reasons[i - y, j - x] == 0:
-                b = phase[i - y, j - x]
-                vb = sigma[i - y, j - x] ** 2
-            if (a - b) * (a - b) > significance * significance * (va + vb):
-                out[i, j] = 1 if a > b else -1
+                for j in range(u * TILE, min(u * TILE + TILE, W)):
+                    out[i, j] = 0
+                    if reasons[i, j] != 0 or (x == 0 and y == 0):
+                        continue
+                    a, b = phase[i, j], phase[i, j]
+                    va = vb = sigma[i, j] ** 2
+                    if 0 <= i + y < H and 0 <= j + x < W and reasons[i + y, j + x] == 0:
+                        a = phase[i + y, j + x]
+                        va = sigma[i + y, j + x] ** 2
+                    if 0 <= i - y < H and 0 <= j - x < W and reasons[i - y, j - x] == 0:
+                        b = phase[i - y, j - x]
+                        vb = sigma[i - y, j - x] ** 2
+                    if (a - b) * (a - b) > significance * significance * (va + vb):
+                        out[i, j] = 1 if a > b else -1
+                        backward[t, u] |= a < b
 
 
-@by_rows(lambda signs, *_: signs.shape[0])
-def majority_backward(first, last, signs, radius, share, least, out):
-    """Where at least `share` of at least `least` signs in the window are backward: a contiguous reversal."""
+@by_rows(lambda _signs, asked, *_: asked.shape[0])
+def mark_backward(first, last, signs, asked, radius, share, least, bit, reasons):
+    """Give `bit` to pixels without a reason where at least `share` of at least `least` signs in the window are
+    backward: a contiguous reversal. Only in tiles that are `asked`; there and around them `signs` must be known.
+    """
     H, W = signs.shape
-    column = np.empty(W, np.int64)
-    for i in range(first, last):
-        column[:] = 0
-        for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-            for j in range(W):
-                column[j] += signs[y, j] < 0
-        for j in range(W):
-            out[i, j] = False
-            back = votes = 0
-            for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                back += column[x]
-            if back == 0:
+    for t in range(first, last):
+        for u in range(asked.shape[1]):
+            if not asked[t, u]:
                 continue
-            back = 0
-            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-                for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                    if signs[y, x] != 0:
-                        votes += 1
-                        if signs[y, x] < 0:
-                            back += 1
-            if votes >= least and back >= share * votes:
-                out[i, j] = True
+            for i in range(t * TILE, min(t * TILE + TILE, H)):
+                for j in range(u * TILE, min(u * TILE + TILE, W)):
+                    if reasons[i, j] != 0:
+                        continue
+                    back = votes = 0
+                    for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+                        for x in range(max(j - radius, 0), min(j + radius + 1, W)):
+                            votes += signs[y, x] != 0
+                            back += signs[y, x] < 0
+                    if votes >= least and back >= share * votes:
+                        reasons[i, j] = bit
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def largest_step(field, factor, floor, i, j, H, W):
-    """T1 without noise: `factor` times the growth that a surface facing both devices has at this pixel, per pixel.
-
-    The growth is channel 2 of `field`, radians per pixel; T1 is at least `floor`.
-    """
-    return max(factor * _spread(field, i, j, H, W, 2), floor)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def linked(phase, sigma, step, noise, i, j, y, x):
-    """Whether two pixels in one row or column or diagonal continue one surface: their phases differ by less than T1.
-
-    T1 = `step` (see `largest_step`) times the distance, plus `noise` standard deviations.
-    """
-    limit = step * max(abs(i - y), abs(j - x)) + noise * math.sqrt(sigma[i, j] ** 2 + sigma[y, x] ** 2)
-    return abs(phase[i, j] - phase[y, x]) < limit
-
-
-@by_rows(lambda phase, *_: phase.shape[0])
-def loose_pixels(first, last, phase, sigma, reasons, field, factor, floor, noise, least, out):
-    """Pixels that stand on a jump: they continue the surface of fewer than `least` of their eight neighbours.
+@by_rows(lambda _phase, _sigma, _reasons, asked, *_: asked.shape[0])
+def mark_loose(first, last, phase, sigma, reasons, asked, field, factor, floor, noise, least, bit, out):
+    """Give `bit` in `out`, a copy of `reasons`, to pixels that stand on a jump: they continue the surface of fewer than
+    `least` of their eight neighbours. Only in the tiles that are `asked`.
 
     At the image border the same share of those inside counts. The eight at distance two may stand in for the next
     ones: on a Bayer sensor these are of the pixel's own colour, and often the only ones with enough light.
     """
     H, W = phase.shape
-    for i in range(first, last):
-        for j in range(W):
-            out[i, j] = False
-            if reasons[i, j] != 0:
+    for t in range(first, last):
+        for u in range(asked.shape[1]):
+            if not asked[t, u]:
                 continue
-            step = largest_step(field, factor, floor, i, j, H, W)
-            loose = True
-            for distance in range(1, 3):
-                links = 0
-                inside = 0
-                for dy in range(-distance, distance + 1, distance):
-                    for dx in range(-distance, distance + 1, distance):
-                        y = i + dy
-                        x = j + dx
-                        if (dy == 0 and dx == 0) or not (0 <= y < H and 0 <= x < W):
-                            continue
-                        inside += 1
-                        if reasons[y, x] != 0:
-                            continue
-                        if linked(phase, sigma, step, noise, i, j, y, x):
-                            links += 1
-                loose = loose and 8 * links < least * inside
-            out[i, j] = loose
-
-
-@njit(cache=True, error_model="numpy")
-def _root(parent, a):
-    while parent[a] != a:
-        parent[a] = parent[parent[a]]
-        a = parent[a]
-    return a
-
-
-@njit(cache=True, error_model="numpy")
-def domains(phase, sigma, reasons, field, factor, floor, noise, label):
-    """Contiguous domains of pixels that are `linked` (union-find): labels (H, W) int32, -1 = masked.
-
-    Links go to the next pixel in the row and the column, and over one masked pixel to the next but one. Returns the
-    number of pixels of every label.
-    """
-    H, W = phase.shape
-    parent = np.arange(H * W)
-    for i in range(H):
-        for j in range(W):
-            if reasons[i, j] != 0:
-                continue
-            step = largest_step(field, factor, floor, i, j, H, W)
-            for back in range(2):
-                y = i - back
-                x = j - 1 + back
-                if y >= 0 and x >= 0 and reasons[y, x] != 0:
-                    y -= back
-                    x -= 1 - back
-                if y < 0 or x < 0 or reasons[y, x] != 0:
-                    continue
-                if linked(phase, sigma, step, noise, i, j, y, x):
-                    a, b = _root(parent, i * W + j), _root(parent, y * W + x)
-                    parent[max(a, b)] = min(a, b)
-    count = 0
-    for a in range(H * W):
-        i, j = a // W, a % W
-        if reasons[i, j] != 0:
-            label[i, j] = -1
-        elif parent[a] == a:
-            label[i, j] = count
-            count += 1
-        else:
-            r = _root(parent, a)
-            label[i, j] = label[r // W, r % W]
-    sizes = np.zeros(count, np.int64)
-    for i in range(H):
-        for j in range(W):
-            if label[i, j] >= 0:
-                sizes[label[i, j]] += 1
-    return sizes
+            for i in range(t * TILE, min(t * TILE + TILE, H)):
+                for j in range(u * TILE, min(u * TILE + TILE, W)):
+                    if reasons[i, j] != 0:
+                        continue
+                    step = largest_step(field, factor, floor, i, j, H, W)
+                    loose = True
+                    for distance in range(1, 3):
+                        links = inside = 0
+                        for dy in range(-distance, distance + 1, distance):
+                            for dx in range(-distance, distance + 1, distance):
+                                y, x = i + dy, j + dx
+                                if (dy == 0 and dx == 0) or not (0 <= y < H and 0 <= x < W):
+                                    continue
+                                inside += 1
+                                if reasons[y, x] == 0 and linked(phase, sigma, step, noise, i, j, y, x):
+                                    links += 1
+                        loose = loose and 8 * links < least * inside
+                        if not loose:
+                            break
+                    if loose:
+                        out[i, j] = bit
 
 
 @njit(cache=True, error_model="numpy")
@@ -273,70 +186,87 @@ def _normal_equations(x, y, value, weight, n, terms, M, rhs):
         rhs[3], rhs[4], rhs[5] = r3, r4, r5
 
 
-@by_rows(lambda phase, *_: phase.shape[0])
-def local_surface(first, last, phase, sigma, label, asked, radius, least, out, roughness):
-    """Distance of each pixel's phase from the surface of its neighbours, in standard deviations; NaN where too few.
+@njit(cache=True, error_model="numpy")
+def _off_surface(phase, sigma, node, label, kind, i, j, radius, least, room, M, c):
+    """Distance of a pixel's phase from the surface of its neighbours, and their roughness; see `mark_off_surface`.
 
-    The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain in the
-    window, without the pixel itself, by least squares with weights 1 / sigma^2 that let go of outliers (Cauchy at 2.5
-    sigma). `roughness` gets the rms of the neighbours about it, in their sigmas; above 1 it widens the yardstick.
-    Pixels that are not `asked` (see `screens.rough_pixels`) get 0 for both.
+    `room` (5, window) and M, c are scratch. NaN where there are too few neighbours.
     """
     H, W = phase.shape
-    room = (2 * radius + 1) ** 2
-    dx, dy, value = np.empty(room), np.empty(room), np.empty(room)
-    inverse, weight = np.empty(room), np.empty(room)
+    dx, dy, value, inverse, weight = room[0], room[1], room[2], room[3], room[4]
+    own = label_of(node, label, kind, i, j)
+    here = phase[i, j]
+    n = 0
+    for y in range(max(i - radius, 0), min(i + radius + 1, H)):
+        for x in range(max(j - radius, 0), min(j + radius + 1, W)):
+            if (y == i and x == j) or label_of(node, label, kind, y, x) != own:
+                continue
+            dx[n] = x - j
+            dy[n] = y - i
+            value[n] = phase[y, x] - here
+            s = float(sigma[y, x])
+            inverse[n] = 1.0 / (s * s)
+            weight[n] = inverse[n]
+            n += 1
+    if n < least:
+        return np.nan, np.nan
+    terms = 6 if n >= 12 else 3
+    c[3] = c[4] = c[5] = 0.0
+    for sweep in range(3):
+        _normal_equations(dx, dy, value, weight, n, terms, M, c)
+        ok, inv00 = _solve(M, c, terms)
+        if not ok:
+            break
+        worst = spread = weight_sum = 0.0
+        for k in range(n):
+            a, b = dx[k], dy[k]
+            r = value[k] - (c[0] + a * (c[1] + c[3] * a + c[4] * b) + b * (c[2] + c[5] * b))
+            z2 = r * r * inverse[k]
+            w = 1.0 / (1.0 + z2 / 6.25)
+            worst = max(worst, z2)
+            spread += w * z2
+            weight_sum += w
+            weight[k] = w * inverse[k]
+        if worst < 9.0 or sweep == 2:
+            spread = math.sqrt(spread / max(weight_sum * (1.0 - terms / n), 1.0))
+            yardstick = math.sqrt(sigma[i, j] ** 2 + inv00) * max(spread, 1.0)
+            return abs(c[0]) / yardstick, spread
+    return np.nan, np.nan
+
+
+@by_rows(lambda phase, *_: phase.shape[0])
+def mark_off_surface(first, last, phase, sigma, node, label, kind, asked, radius, least, far, rough, bit, reasons,
+                     measures):  # fmt: skip
+    """Give `bit` to pixels without a reason whose phase lies more than `far` standard deviations off the surface of
+    their neighbours, or whose neighbours are rougher than `rough`, or too few.
+
+    The surface is a quadric (a plane with fewer than 12 neighbours) through the pixels of the same domain (see
+    `domains.py`) in the window, without the pixel itself, by least squares with weights 1 / sigma^2 that let go of
+    outliers (Cauchy at 2.5 sigma). Roughness is the rms of the neighbours about it, in their sigmas; above 1 it widens
+    the yardstick. Pixels that are not `asked` (see `screens.rough_pixels`) are taken as lying on it. `measures` (2, H,
+    W), if it is not empty, gets both figures, NaN where there is none.
+    """
+    W = phase.shape[1]
+    room = np.empty((5, (2 * radius + 1) ** 2))
     M = np.empty((7, 6))
     c = np.zeros(6)
     for i in range(first, last):
-        for j in range(W):
-            out[i, j] = np.nan
-            roughness[i, j] = np.nan
-            own = label[i, j]
-            if own < 0:
+        row = asked[i]
+        for col in range(0, W, 64):
+            end = min(col + 64, W)
+            some = False
+            for j in range(col, end):
+                some |= row[j]
+            if not some:
                 continue
-            if not asked[i, j]:
-                out[i, j] = 0.0
-                roughness[i, j] = 0.0
-                continue
-            n = 0
-            here = phase[i, j]
-            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-                for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                    if label[y, x] != own or (y == i and x == j):
-                        continue
-                    dx[n] = x - j
-                    dy[n] = y - i
-                    value[n] = phase[y, x] - here
-                    s = float(sigma[y, x])
-                    inverse[n] = 1.0 / (s * s)
-                    weight[n] = inverse[n]
-                    n += 1
-            if n < least:
-                continue
-            terms = 6 if n >= 12 else 3
-            c[3] = c[4] = c[5] = 0.0
-            for sweep in range(3):
-                _normal_equations(dx, dy, value, weight, n, terms, M, c)
-                ok, inv00 = _solve(M, c, terms)
-                if not ok:
-                    break
-                worst = spread = weight_sum = 0.0
-                for k in range(n):
-                    a, b = dx[k], dy[k]
-                    r = value[k] - (c[0] + a * (c[1] + c[3] * a + c[4] * b) + b * (c[2] + c[5] * b))
-                    z2 = r * r * inverse[k]
-                    w = 1.0 / (1.0 + z2 / 6.25)
-                    worst = max(worst, z2)
-                    spread += w * z2
-                    weight_sum += w
-                    weight[k] = w * inverse[k]
-                if worst < 9.0 or sweep == 2:
-                    spread = math.sqrt(spread / max(weight_sum * (1.0 - terms / n), 1.0))
-                    yardstick = math.sqrt(sigma[i, j] ** 2 + inv00) * max(spread, 1.0)
-                    out[i, j] = abs(c[0]) / yardstick
-                    roughness[i, j] = spread
-                    break
+            for j in range(col, end):
+                if not row[j] or reasons[i, j] != 0:
+                    continue
+                distance, roughness = _off_surface(phase, sigma, node, label, kind, i, j, radius, least, room, M, c)
+                if measures.size > 0:
+                    measures[0, i, j], measures[1, i, j] = distance, roughness
+                if not (distance <= far and roughness <= rough):
+                    reasons[i, j] = bit
 
 
 @by_rows(lambda _xyz, sigma, *_: sigma.shape[0])

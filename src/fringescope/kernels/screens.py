@@ -1,6 +1,6 @@
 """Quick looks before slow ones: which pixels a mask has to judge at all. Most surfaces are calm almost everywhere.
 
-Each screen passes a pixel only where the slow kernel of `regions.py` or `fringes.py` could not reject or change it; it
+Each screen passes a pixel only where the slow kernel of `regions.py` would not reject it (with sigmas that neighbours share but for a factor of two or three); it
 asks for all others (True). In float32, in loops that compilers turn into vector instructions; arrays and scalars only.
 """
 
@@ -83,11 +83,12 @@ def _steps_between(p, q, r, m, most, mask):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _verdict(off, most, mask, step, n, ask):
+def _verdict(off, most, mask, reasons, step, n, ask):
     for j in range(n):
         steep = max(max(most[j], most[j + 1]), max(max(most[j + 2], most[j + 3]), most[j + 4]))
         masked = mask[j] | mask[j + 1] | mask[j + 2] | mask[j + 3] | mask[j + 4]
-        ask[j] = (off[j] > _ZERO) | (steep > step) | (masked != 0) | (off[j] != off[j])
+        rough = (off[j] > _ZERO) | (steep > step) | (masked != 0) | (off[j] != off[j])
+        ask[j] = rough & (reasons[j] == 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -100,11 +101,11 @@ def _some(row):
 
 
 @by_rows(lambda phase, *_: phase.shape[0])
-def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
+def rough_pixels(first, last, phase, sigma, reasons, step, limit, wide_limit, ask):
     """Pixels that `regions.local_surface` (5 x 5) must judge: True in `ask` (H, W).
 
-    The others lie, like their 24 neighbours, within `limit` sigmas of the quadric through these, none of the 25 is
-    masked, and no step between neighbours reaches `step` radians: they are one domain.
+    The others are masked; or they lie within `limit` sigmas of the quadric through their 24 neighbours, these within
+    `wide_limit`, none of the 25 is masked, and no step between neighbours reaches `step` radians: they are one domain.
     """
     H, W = phase.shape
     m = BLOCK + 4
@@ -112,15 +113,23 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
     c0, c1, c2 = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     c3, c4, c5 = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     off, most, mask = np.empty(BLOCK, np.float32), np.empty(m, np.float32), np.empty(m, np.uint16)
-    limit2, step = _f(limit) * _f(limit), _f(step)
+    limit2, wide2, step = _f(limit) * _f(limit), _f(wide_limit) * _f(wide_limit), _f(step)
     for i in range(first, last):
         if i < 2 or i >= H - 2 or W < 5:
-            ask[i, :] = True
+            for j in range(W):
+                ask[i, j] = reasons[i, j] == 0
             continue
-        ask[i, :2] = True
-        ask[i, W - 2 :] = True
+        for j in range(2):
+            ask[i, j] = reasons[i, j] == 0
+            ask[i, W - 1 - j] = reasons[i, W - 1 - j] == 0
         for col in range(2, W - 2, BLOCK):
             n = min(BLOCK, W - 2 - col)
+            void = True
+            for j in range(col, col + n):
+                void &= reasons[i, j] != 0
+            if void:
+                ask[i, col : col + n] = False
+                continue
             left, right = col - 2, col + n + 2
             wide = n + 4
             centre = phase[i, left:right]
@@ -134,7 +143,7 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
                 off[j] = c0[j] * c0[j] - limit2 * (sigma[i, col + j] * sigma[i, col + j])
             for y in range(-2, 3):
                 _off_quadric(
-                    phase[i + y, left:right], sigma[i + y, left:right], centre, _f(y), limit2, n,
+                    phase[i + y, left:right], sigma[i + y, left:right], centre, _f(y), wide2, n,
                     c0, c1, c2, c3, c4, c5, off,
                 )  # fmt: skip
             for j in range(wide):
@@ -145,48 +154,4 @@ def rough_pixels(first, last, phase, sigma, reasons, step, limit, ask):
                 _steps_between(
                     phase[i + y, left:right], phase[i + below, left:right], reasons[i + y, left:right], wide, most, mask
                 )
-            _verdict(off, most, mask, step, n, ask[i, col : col + n])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _widen(row, m, low, high):
-    """Take a row's values into the least and greatest per column; NaN takes no part."""
-    for j in range(m):
-        low[j] = row[j] if row[j] < low[j] else low[j]
-        high[j] = row[j] if row[j] > high[j] else high[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _shifted(low, high, other_low, other_high, n):
-    for j in range(n):
-        low[j] = other_low[j] if other_low[j] < low[j] else low[j]
-        high[j] = other_high[j] if other_high[j] > high[j] else high[j]
-
-
-@by_rows(lambda phase, *_: phase.shape[0])
-def torn_orders(first, last, phase, radius, range_, ask):
-    """Pixels whose order the neighbours' vote may change: True in `ask` (H, W).
-
-    Where the phases in the window of `radius` differ by less than `range_` (pi), every voter is for the own order.
-    """
-    H, W = phase.shape
-    m = BLOCK + 2 * radius
-    low, high = np.empty(m, np.float32), np.empty(m, np.float32)
-    least, most = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    far, big = _f(range_), _f(np.inf)
-    for i in range(first, last):
-        for col in range(0, W, BLOCK):
-            n = min(BLOCK, W - col)
-            left, right = max(col - radius, 0), min(col + n + radius, W)
-            skip = left - (col - radius)  # columns of the scratch that lie outside the picture
-            low[:] = big
-            high[:] = -big
-            for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-                _widen(phase[y, left:right], right - left, low[skip:], high[skip:])
-            least[:n] = big
-            most[:n] = -big
-            for x in range(2 * radius + 1):
-                _shifted(least, most, low[x : x + n], high[x : x + n], n)
-            target = ask[i, col : col + n]
-            for j in range(n):
-                target[j] = most[j] - least[j] >= far
+            _verdict(off, most, mask, reasons[i, col : col + n], step, n, ask[i, col : col + n])

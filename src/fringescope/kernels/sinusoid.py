@@ -18,7 +18,7 @@ _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
         0.99999934, -0.33329861, 0.19946567, -0.13908633, 0.09642202, -0.05591235, 0.02186295, -0.00405456,
     )
 )  # fmt: skip
-_ZERO, _QUARTER, _HALF, _ONE, _TWO = (np.float32(c) for c in (0.0, 0.25, 0.5, 1.0, 2.0))
+_ZERO, _QUARTER, _HALF, _ONE, _TWO, _THREE, _FOUR = (np.float32(c) for c in (0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0))
 _TINY = np.float32(1e-30)
 
 
@@ -60,13 +60,13 @@ def phase_variance(variance, background_share, modulation, cos_phase, gain, step
     """
     v = variance
     if steps == 3:
-        cos3 = cos_phase * (4 * cos_phase * cos_phase - 3)
-        v = v - background_share * modulation * cos3 / 2
+        cos3 = cos_phase * (_FOUR * cos_phase * cos_phase - _THREE)
+        v = v - background_share * modulation * cos3 * _HALF
     return gain * v / (modulation * modulation)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def follow(absolute, sigma, phase, fine_sigma, ratio):
+def follow(absolute, variance, phase, fine_variance, ratio):
     """One step from coarse to fine, in turns: absolute phase of the finer set, chi squared, margin^2 of the rounding.
 
     The margin: how many standard deviations worse the next turn would fit, squared.
@@ -74,6 +74,5 @@ def follow(absolute, sigma, phase, fine_sigma, ratio):
     predicted = absolute * ratio
     n = whole(predicted - phase + _HALF)
     rest = predicted - phase - n
-    scaled = sigma * ratio
-    variance = scaled * scaled + fine_sigma * fine_sigma
-    return phase + n, rest * rest / variance, (_ONE - _TWO * abs(rest)) / variance
+    weight = _ONE / (variance * (ratio * ratio) + fine_variance)
+    return phase + n, rest * rest * weight, (_ONE - _TWO * abs(rest)) * weight

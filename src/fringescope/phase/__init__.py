@@ -14,9 +14,9 @@ from fringescope.phase.order import (
     settle_order,
     trial,
     unambiguous_span,
-    vote_on_orders,
 )
 from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, mean_picture
+from fringescope.phase.vote import vote_on_orders
 
 __all__ = [
     "PARALLEL_RAD",

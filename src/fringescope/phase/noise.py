@@ -15,7 +15,7 @@ from fringescope.phase.sums import Measured
 from fringescope.types import F64, AnyArray, NoiseModel
 from fringescope.types.capture import ROUNDING
 
-SAMPLES = 100_000  #: pixels that are enough to tell the noise
+SAMPLES = 50_000  #: pixels that are enough to tell the noise
 SPOILT = 3.0  #: a set whose residuals are this many times those of the quietest set is no measure of noise
 
 
@@ -76,13 +76,14 @@ def _binned(background: AnyArray, variance: AnyArray, dof: int, max_value: int) 
     out: list[tuple[float, float, float]] = []
     ok = (0.01 * max_value < background) & (0.9 * max_value > background)
     if np.count_nonzero(ok) >= 400:
-        level, rest = background[ok].astype(np.float64), variance[ok].astype(np.float64)
+        order = np.argsort(background[ok])
+        level, rest = background[ok][order].astype(np.float64), variance[ok][order].astype(np.float64)
         edges = np.unique(np.quantile(level, np.linspace(0, 1, 25)))
-        where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(len(edges) - 2, 0))
-        for n in range(len(edges) - 1):
-            inside = where == n
-            if inside.sum() >= 50:
-                out.append((float(level[inside].mean()), _typical(rest[inside], dof), float(inside.sum()) * dof))
+        begin = np.searchsorted(level, edges[:-1], side="left")
+        for first, last in pairwise([*begin.tolist(), len(level)]):
+            if last - first >= 50:
+                typical = _typical(rest[first:last], dof)
+                out.append((float(level[first:last].mean()), typical, float(last - first) * dof))
     return _Bins(*np.array(out, np.float64).reshape(-1, 3).T)
 
 

@@ -7,19 +7,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from fringescope import geometry
 from fringescope.errors import DecodeError
 from fringescope.kernels import fringes as k
-from fringescope.kernels import screens
+from fringescope.phase.vote import elect
 from fringescope.settings import PhaseSettings
 from fringescope.types import (
     F32,
     F64,
     U16,
-    Bool,
     Decoded,
     Direction,
     FringeSet,
@@ -31,8 +29,6 @@ from fringescope.types import (
 )
 
 MOST_REPEATS = 2.5  #: of what the sets tell apart, that a ray may cross in the measuring space
-CONFIRMATIONS = 3  #: rounds in which pixels that are certain confirm uncertain neighbours
-ORDER = 0.99 * math.pi  #: phases of neighbours that differ by less are of one order, whatever their slope
 LEAST_SYSTEMATIC = 0.005  #: rad; less is not believed of any fringes
 MOST_MISS = 2.5  #: systematic errors, amplified by the ratio of the periods, by which a set may miss all over
 PARALLEL_RAD = 1e-4  #: sets whose gradients differ less than this in angle (either sign) unwrap each other
@@ -209,35 +205,16 @@ def _check_repeats(group: Sequence[WrappedSet], bounds: F64, camera: str, s: Pha
         )
 
 
-def vote_on_orders(decoded: Decoded, s: PhaseSettings) -> tuple[Decoded, Bool]:
-    """The neighbours' vote on the orders of a view's one direction; also where (H, W) orders changed (or (0, 0)).
-
-    `reasons` tells the orders that are uncertain, and may tell more. Darkness and low modulation outweigh an uncertain
-    order, darkness also frames that do not fit.
-    """
-    d, reasons = decoded.directions[0], decoded.reasons
-    uncertain = (reasons & Reason.ORDER_UNCERTAIN) != 0
-    absolute = d.phase
-    if s.order_votes > 1:
-        absolute, uncertain = _elect(d.phase, d.sigma, uncertain, s)
-    changed = absolute is not d.phase
-    moved = np.isfinite(absolute) & (absolute != d.phase) if changed else np.zeros((0, 0), np.bool_)
-    out = np.empty_like(reasons)
-    weak = Reason.DARK | Reason.LOW_MODULATION | Reason.SATURATED
-    bits = (np.uint16(x) for x in (Reason.ORDER_UNCERTAIN, weak, Reason.DARK, Reason.INCONSISTENT))
-    k.weigh_reasons(reasons, uncertain, *bits, out)
-    return replace(decoded, directions=(replace(d, phase=absolute),), reasons=out), np.asarray(moved)
-
-
 def _unwrap(
     group: Sequence[WrappedSet], bounds: F64, gray: F32 | None, half: float, soft: float, s: PhaseSettings
 ) -> tuple[Direction, U16]:
     absolute, margin = _search(group, bounds, gray, half, soft, s)
-    uncertain = ~(margin >= s.order_min_margin)
+    uncertain = np.uint16(Reason.ORDER_UNCERTAIN)
+    reasons = np.where(margin >= s.order_min_margin, np.uint16(0), uncertain)
     if s.order_votes > 1:
-        absolute, uncertain = _elect(absolute, group[-1].sigma, uncertain, s)
-    reasons = np.where(uncertain | ~np.isfinite(absolute), np.uint16(Reason.ORDER_UNCERTAIN), np.uint16(0))
-    return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons.astype(np.uint16)
+        elect(absolute, group[-1].sigma, reasons, s)
+    reasons[~np.isfinite(absolute)] |= uncertain
+    return Direction(group[-1].g, absolute, group[-1].sigma, margin), reasons
 
 
 def _search(
@@ -252,57 +229,6 @@ def _search(
     unexpected = s.unexpected_sigma**2
     k.unwrap(phases, sigmas, freq, bounds, unexpected, none if gray is None else gray, half, soft, absolute, margin)
     return absolute, margin
-
-
-def _elect(absolute: F32, sigma: F32, uncertain: Bool, s: PhaseSettings) -> tuple[F32, Bool]:
-    """Repair single wrong orders by the vote of the neighbours; returns the phase, and which orders stay uncertain.
-
-    Three rounds among all trusted pixels change orders that a majority contradicts. In the last rounds only pixels that
-    are certain vote: they confirm, or fail to confirm, the orders of the others. A region that is uncertain as a
-    whole stays so.
-    """
-    voters = np.empty_like(absolute)
-    k.voters(absolute, sigma, s.max_sigma_rad, voters)
-    slope = _usual_slope(voters)
-    radius = s.order_votes // 2
-    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    least = max(3, window.size // 4)
-    asked = np.empty(absolute.shape, bool)
-    screens.torn_orders(voters, radius, ORDER, asked)  # where neighbours are of one mind there is nothing to ask
-    if not asked.any() and not uncertain.any():
-        return absolute, uncertain
-    changed = np.zeros(absolute.shape, np.int8)
-    for _ in range(3):
-        out = np.empty_like(absolute)
-        k.order_votes(absolute, voters, asked, radius, least, s.order_majority, slope, out, changed)
-        moved = asked & (changed != 0) & (changed >= -8) & (changed <= 8)
-        if not moved.any():
-            break
-        absolute, uncertain = out, uncertain & ~moved
-        k.voters(absolute, sigma, s.max_sigma_rad, voters)
-        asked = cv2.dilate(moved.view(np.uint8), window).view(bool)  # elsewhere the vote would be the same again
-    split = changed == -128
-    for _ in range(CONFIRMATIONS):
-        sure = np.where(uncertain | split, np.float32(np.nan), voters)
-        k.order_votes(absolute, sure, uncertain, radius, least, s.order_majority, slope, out, changed)
-        confirmed = uncertain & (changed == 127)
-        uncertain = uncertain & ~confirmed
-        if not confirmed.any():
-            break
-    return absolute, np.asarray(uncertain | split)
-
-
-def _usual_slope(phase: F32) -> float:
-    """Largest believable phase slope, radians per pixel: four times the usual one, at most 1.2."""
-    usual = 0.0
-    stride = max(1, math.isqrt(phase.size // 60_000))  # enough for a median
-    for axis in (0, 1):
-        every = phase[::stride] if axis == 1 else phase[:, ::stride]
-        d = np.diff(every, axis=axis)
-        d = d[np.isfinite(d)]
-        if d.size:
-            usual = max(usual, float(np.median(np.abs(d))))
-    return min(max(4 * usual, 0.2), 1.2)
 
 
 def _gray_phase(codes: Sequence[GrayCode], fine: WrappedSet, used: set[int]) -> tuple[F32 | None, float, float]:

@@ -111,9 +111,10 @@ def _points(decoded: Decoded, rig: Rig, s: Settings) -> Grid:
 
 def _masked(decoded: Decoded, reasons: U16, rig: Rig, s: Settings) -> U16:
     """The masks that look at a pixel's neighbours, one after the other."""
-    reasons = denoise.monotonic(decoded, reasons, rig, s.denoise)  # III-D 2
-    reasons = denoise.connected(decoded, reasons, rig, s.denoise)  # III-D 3
-    return denoise.local(decoded, reasons, rig, s.denoise)
+    tiles = denoise.Tiles(decoded)
+    reasons = denoise.monotonic(decoded, reasons, rig, s.denoise, tiles)  # III-D 2
+    reasons = denoise.connected(decoded, reasons, rig, s.denoise, tiles)  # III-D 3
+    return denoise.local(decoded, reasons, rig, s.denoise, tiles)
 
 
 BAND = 1_000_000  #: pixels of a board picture that are decoded at a time

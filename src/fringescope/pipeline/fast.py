@@ -6,7 +6,6 @@ response corrections, RGB, very deep measuring spaces) goes the stages' way.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,17 +13,15 @@ from typing import Literal
 
 import numpy as np
 
-from fringescope import denoise, geometry, phase
+from fringescope import denoise, geometry, memory, phase
 from fringescope.errors import RigError
 from fringescope.kernels import fused as k
 from fringescope.kernels.depths import Depths
 from fringescope.settings import Settings
-from fringescope.threads import WORKERS, in_bands
 from fringescope.types import (
     F32,
     F64,
     AnyArray,
-    Bool,
     Camera,
     Decoded,
     Direction,
@@ -42,7 +39,6 @@ from fringescope.types import (
 Device = Literal["cpu", "gpu"]  #: where the fused kernel runs
 
 MOST_ERROR_MM = 1e-4  #: of the depth table against the exact solution
-LARGE = 1 << 20  #: samples of a band of all frames: they stay in the second cache
 TWO_PI = 2 * np.pi
 f4 = np.float32
 
@@ -73,8 +69,8 @@ def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> tu
     if way is None:
         return None
     H, W = way.frames[0].shape
-    absolute, sigma, A, B, sigma_mm = (np.empty((H, W), np.float32) for _ in range(5))
-    reasons, xyz = np.empty((H, W), np.uint16), np.empty((H, W, 3), np.float32)
+    absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
+    reasons, xyz = memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32)
     out = (absolute, sigma, A, B, reasons, xyz, sigma_mm)
     if device == "gpu":
         from fringescope.pipeline import gpu  # only then: Numba's CUDA is slow to import
@@ -83,23 +79,23 @@ def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> tu
             return None
         gpu.by_slabs(way.frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
     else:
-        by_bands(way, out)
+        on_cpu(way, out)
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
         way.notes,
     )
-    voted, moved = phase.vote_on_orders(decoded, s.phase)
-    if moved.any():
-        _points_again(voted, moved, way, rig, s, xyz, sigma_mm)
-    return voted, xyz, sigma_mm
+    moved = phase.vote_on_orders(decoded, s.phase)
+    if moved is not None:
+        _points_again(decoded, *moved, way, rig, s, xyz, sigma_mm)
+    return decoded, xyz, sigma_mm
 
 
 def _points_again(
-    decoded: Decoded, moved: Bool, way: Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
+    decoded: Decoded, rows: AnyArray, columns: AnyArray, way: Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
 ) -> None:
     """Points of the pixels whose order the vote has changed, by the same table in float64."""
-    rows, columns = np.nonzero(moved)
+    moved = rows, columns
     camera = rig.camera(decoded.camera)
     d = decoded.directions[0]
     uv = np.stack([columns, rows], -1).astype(np.float64)
@@ -151,6 +147,7 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
         (signs * np.sin(angles)).astype(f4),
         np.append(1.0, frequency[1:] / frequency[:-1]).astype(f4),
         frequency,
+        np.array([np.dot(h, g) > 0 for _, h in family]),
         fmt.max_value,
         f4(pivot),
     )
@@ -241,18 +238,10 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
     )
 
 
-def by_bands(way: Way, out: tuple[AnyArray, ...]) -> None:
-    """Runs the kernel over bands of rows on all cores; each core copies the rows of all frames into its own scratch."""
-    H, W = way.frames[0].shape
-    rows = max(1, min(LARGE // (len(way.frames) * W), -(-H // WORKERS)))
-    mine = threading.local()
-
-    def band(first: int, last: int) -> None:
-        if not hasattr(mine, "frames"):
-            mine.frames = np.empty((len(way.frames), rows, W), way.frames[0].dtype)
-        for here, frame in zip(mine.frames, way.frames, strict=True):
-            here[: last - first] = frame[first:last]
-        k.decode(0, last - first, mine.frames, first, H, way.sets, way.limits, way.bounds, way.usual, way.depths,
-                 *(a[first:last] for a in out))  # fmt: skip
-
-    in_bands(H, rows, band)
+def on_cpu(way: Way, out: tuple[AnyArray, ...]) -> None:
+    """Runs the kernel over rows on all cores; it reads the frames where they lie."""
+    frames = [f if f.strides[1] == f.itemsize else np.ascontiguousarray(f) for f in way.frames]
+    addresses = np.array([f.ctypes.data for f in frames], np.int64)
+    row_bytes = np.array([f.strides[0] for f in frames], np.int64)
+    like = np.empty(0, frames[0].dtype)
+    k.decode(addresses, row_bytes, like, way.sets, way.limits, way.bounds, way.usual, way.depths, *out)
