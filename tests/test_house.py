@@ -41,6 +41,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "types": ({"errors"}, "data, no behaviour"),
     "settings": ({"errors"}, "data, no behaviour"),
     "threads": (set(), "rows on all cores: knows nothing of what the rows hold"),
+    "gpu": ({"threads"}, "slabs of rows through a GPU: knows nothing of what the rows hold"),
     "memory": (set(), "large arrays used again: knows nothing of what they hold"),
     "kernels": ({"threads"}, "arrays in, arrays out: they know no dataclass, file or device"),
     "geometry": (DATA | {"kernels"}, "poses and lenses on top of the lens kernels"),
@@ -54,7 +55,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "store": (DATA, "files know data, not algorithms"),
     "importing": (DATA | {"store"}, "other people's images become one of our captures"),
     "export": (DATA, "files know data, not algorithms"),
-    "pipeline": (BOTTOM | STAGES | {"capture", "threads"}, "all ordering lives here: objects, no files"),
+    "pipeline": (BOTTOM | STAGES | {"capture", "threads", "gpu"}, "all ordering lives here: objects, no files"),
     "server": (ANYTHING, "the rim: nobody imports it"),
     "bench": (ANYTHING, "times the whole, for the command line alone"),
     "warmup": (ANYTHING, "a tiny scan from end to end, for the command line alone"),
@@ -69,7 +70,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 #: Packages that only some units may import, and which.
 CONFINED = {
-    "numba": {"kernels", "threads", "twin"},
+    "numba": {"kernels", "threads", "twin", "gpu"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"report", "evaluate"},
@@ -229,7 +230,7 @@ def test_every_dependency_is_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core, extras = project["dependencies"], project["optional-dependencies"]
     dev = [*core, *extras["test"], *extras["docs"], *extras["dev"]]
-    for name, wanted in (("core", core), ("dev", dev)):
+    for name, wanted in (("core", core), ("dev", dev), ("gpu", [*core, *extras["gpu"]])):
         text = (ROOT / "constraints" / f"{name}.txt").read_text()
         pinned = {m.group(1).lower() for m in re.finditer(r"^([\w.-]+)==", text, re.M)}
         needed = {re.split(r"[\s\[<>=!~;]", d)[0].lower() for d in wanted} - {"fringescope"}

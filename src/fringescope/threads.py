@@ -6,7 +6,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from numba import njit
@@ -51,6 +51,11 @@ def by_rows(count: Callable[..., int]) -> Callable[[Callable[..., None]], Callab
         return call
 
     return decorate
+
+
+def later(work: Callable[..., None], *args: Any) -> Future[None]:
+    """Start `work(*args)` on some core."""
+    return _pool(os.getpid()).submit(work, *args)
 
 
 def in_bands(height: int, rows: int, work: Callable[[int, int], None]) -> None:

@@ -51,6 +51,7 @@ def scan_into(
     preview: bool = True,
     only: Sequence[str] | None = None,
     response: Path | None = None,
+    device: str = "cpu",
 ) -> tuple[Scan, dict[str, Any]]:
     """Reconstructs a capture (of some cameras `only`) and writes the scan into a folder that is being made; returns it
     with its scan.json.
@@ -58,11 +59,12 @@ def scan_into(
     from fringescope import export, pipeline, store
     from fringescope.settings import to_dict
 
+    where = pipeline.check_device(device)
     c = picked(store.read_capture(capture), only)
     r = store.read_rig(rig)
     store.check_rig(c, r)
     views = store.view_inputs(c, load_response(response))
-    scan = pipeline.scan(views, r, s, all_points=all_points, progress=progress.share)
+    scan = pipeline.scan(views, r, s, all_points=all_points, device=where, progress=progress.share)
     if preview and scan.preview is not None:
         page = export.viewer_page(scan.preview, title=folder_title(capture))
         (folder / "view.html").write_text(page, encoding="utf-8")
@@ -124,6 +126,9 @@ def reconstruct(
     preview: Annotated[bool, typer.Option(help="Also write view.html, which shows the surface in a browser.")] = True,
     only: Views = None,
     response: ResponseFile = None,
+    device: Annotated[
+        str, typer.Option(metavar="cpu|gpu", help="Where frames become points: gpu needs fringescope[gpu].")
+    ] = "cpu",
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
@@ -136,7 +141,7 @@ def reconstruct(
     with store.new_folder(out, marker="scan.json", force=force) as tmp, Progress() as progress:
         _, doc = scan_into(
             tmp, capture, rig, s, progress,
-            grids=grids, all_points=all_points, preview=preview, only=only, response=response,
+            grids=grids, all_points=all_points, preview=preview, only=only, response=response, device=device,
         )  # fmt: skip
     emit({"scan": str(out), **doc}, json, scan_summary(doc, out))
 

@@ -1,9 +1,9 @@
 """Raw frames to points in one pass, block by block: everything between samples and point stays in the first caches.
 
-Composes the scalar functions of `sinusoid.py` in float32, in loops over blocks of pixels that compilers turn into
-vector instructions; only `pipeline` calls it. Pixels with saturated samples take the scalar way of `fringes.py`, in
-float64. What keeps the loops fast: scratch arrays that live as long as the call, slices instead of offsets in indices,
-and no branch but `a if c else b`. Contracted multiply-adds are the one liberty that the compiler has; NaN stays NaN.
+Composes the loops of `blocks.py` and `depths.py`, in float32; only `pipeline` calls it. Pixels with saturated samples
+take the scalar way of `fringes.py`, in float64. What keeps the loops fast: scratch arrays that live as long as the
+call, slices instead of offsets in indices, and no branch but `a if c else b`. Contracted multiply-adds are the one
+liberty that the compiler has; NaN stays NaN.
 """
 
 import math
@@ -12,24 +12,37 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from fringescope.kernels.blocks import (
+    BLOCK,
+    accept,
+    all_dark,
+    candidates,
+    coarsest,
+    consider,
+    eight,
+    fit,
+    four,
+    judge,
+    leave_dark,
+    order_margin,
+    ramp,
+    row_between,
+    rows_between,
+    step,
+    sums,
+)
 from fringescope.kernels.depths import mark_outside, points, row_cubics
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
+from fringescope.kernels.pixel import TWO_PI
 from fringescope.kernels.raw import samples_at
-from fringescope.kernels.sinusoid import ROUNDING, follow, left_over, phase_variance, turns
+from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
-
-BLOCK = 512  #: pixels of a row that are worked on together
-TWO_PI = np.float32(2 * math.pi)
 
 _f = np.float32
 _ZERO, _HALF, _ONE, _TWO = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0))
 _INF = np.float32(np.inf)
 _NAN = np.float32(np.nan)
-_P, _Q, _S = BLOCK, 2 * BLOCK, 3 * BLOCK  # where the sums of I cos, I sin and I^2 lie in their scratch
 _CONTRACT = {"contract"}
-_FAR = np.int32(1 << 30)
-_HALF_ROOT = np.float32(math.sqrt(0.5))
-_PER_TURN2 = np.float32(1.0 / (4.0 * math.pi**2))
 
 
 class Sets(NamedTuple):
@@ -69,243 +82,8 @@ class Limits(NamedTuple):
     inconsistent: np.uint16
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _sums(x, first, last, cos, sin, pivot, n, acc):
-    """Sums of I, I cos, I sin and squared residuals of frames first..last-1 of a block `x` (F, BLOCK), into `acc`.
-
-    Samples count from `pivot` on.
-    """
-    for j in range(n):
-        acc[j] = _ZERO
-        acc[_P + j] = _ZERO
-        acc[_Q + j] = _ZERO
-        acc[_S + j] = _ZERO
-    f = first
-    while f + 4 <= last:
-        xa, xb, xc, xd = x[f], x[f + 1], x[f + 2], x[f + 3]
-        ca, cb, cc, cd = cos[f], cos[f + 1], cos[f + 2], cos[f + 3]
-        sa, sb, sc, sd = sin[f], sin[f + 1], sin[f + 2], sin[f + 3]
-        for j in range(n):
-            a, b, c, d = _f(xa[j]) - pivot, _f(xb[j]) - pivot, _f(xc[j]) - pivot, _f(xd[j]) - pivot
-            acc[j] += (a + b) + (c + d)
-            acc[_P + j] += (a * ca + b * cb) + (c * cc + d * cd)
-            acc[_Q + j] += (a * sa + b * sb) + (c * sc + d * sd)
-            acc[_S + j] += (a * a + b * b) + (c * c + d * d)
-        f += 4
-    while f < last:
-        xa = x[f]
-        ca, sa = cos[f], sin[f]
-        for j in range(n):
-            a = _f(xa[j]) - pivot
-            acc[j] += a
-            acc[_P + j] += a * ca
-            acc[_Q + j] += a * sa
-            acc[_S + j] += a * a
-        f += 1
-    mean, gain = _ONE / _f(last - first), _TWO / _f(last - first)
-    for j in range(n):
-        t, p, q = acc[j], acc[_P + j], acc[_Q + j]
-        acc[_S + j] = left_over(acc[_S + j], t, p, q, t * mean, p * gain, q * gain, _ONE)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _four(x, first, n, acc):
-    """As `_sums` for four steps, by differences: no sum of squares, but that of the residuals, which is one square."""
-    xa, xb, xc, xd = x[first], x[first + 1], x[first + 2], x[first + 3]
-    total, in_phase, quadrature, rest = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
-    for j in range(n):
-        a, b, c, d = _f(xa[j]), _f(xb[j]), _f(xc[j]), _f(xd[j])
-        even, odd = a + c, b + d
-        total[j] = even + odd
-        in_phase[j] = a - c
-        quadrature[j] = b - d
-        off = even - odd
-        rest[j] = _f(0.25) * off * off
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _eight(x, first, n, acc):
-    """As `_four`, for eight steps: the residuals are the second, third and fourth harmonics of the samples."""
-    x0, x1, x2, x3 = x[first], x[first + 1], x[first + 2], x[first + 3]
-    x4, x5, x6, x7 = x[first + 4], x[first + 5], x[first + 6], x[first + 7]
-    total, in_phase, quadrature, rest = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
-    for j in range(n):
-        a, b, c, d = _f(x0[j]), _f(x1[j]), _f(x2[j]), _f(x3[j])
-        e, f, g, h = _f(x4[j]), _f(x5[j]), _f(x6[j]), _f(x7[j])
-        s0, s1, s2, s3 = a + e, b + f, c + g, d + h
-        d0, d1, d2, d3 = a - e, b - f, c - g, d - h
-        even, odd = s0 + s2, s1 + s3
-        u, v = _HALF_ROOT * (d1 - d3), _HALF_ROOT * (d1 + d3)
-        total[j] = even + odd
-        in_phase[j] = d0 + u
-        quadrature[j] = d2 + v
-        c2, q2, c3, q3, c4 = s0 - s2, s1 - s3, d0 - u, v - d2, even - odd
-        rest[j] = _f(0.25) * ((c2 * c2 + q2 * q2) + (c3 * c3 + q3 * q3)) + _f(0.125) * c4 * c4
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _fit(acc, steps, noise_a, noise_b, misfit2, pivot, n, phase, variance, background, modulation, rough):
-    """Sums to wrapped phase and its variance, turns, A and B; `rough` grows above 0 where a set misses its sinusoid.
-
-    That is where the variance of the samples about it exceeds `misfit2` times that of the noise.
-    """
-    mean, gain = _ONE / _f(steps), _TWO / _f(steps)
-    share = _ONE / _f(steps - 3) if steps > 3 else _ZERO
-    total, in_phase, quadrature, residuals = acc[:_P], acc[_P:_Q], acc[_Q:_S], acc[_S:]
-    for j in range(n):
-        t, p, q = total[j], in_phase[j], quadrature[j]
-        a, c, s = t * mean, p * gain, q * gain
-        b = math.sqrt(c * c + s * s)
-        rest = residuals[j] * share
-        a += pivot
-        v = noise_a + noise_b * a
-        v = v if v > _f(ROUNDING) else _f(ROUNDING)
-        phase[j] = turns(s, c)
-        background[j] = a
-        modulation[j] = b
-        off, worst = rest - misfit2 * v, rough[j]
-        rough[j] = off if off > worst else worst
-        variance[j] = phase_variance(v, _ZERO, b, _ONE, gain, 4) * _PER_TURN2
-    if steps == 3:
-        for j in range(n):
-            c, b = in_phase[j] * gain, modulation[j]
-            v = noise_a + noise_b * background[j]
-            v = phase_variance(max(v, _f(ROUNDING)), noise_b, b, c / b, gain, 3)
-            variance[j] = max(v, _ZERO) * _PER_TURN2
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _ramp(nodes, scale, col, n, out):
-    """Values between nodes that lie 1 / `scale` columns apart, the first at column 0, at columns col..col+n-1."""
-    last = len(nodes) - 2
-    j = 0
-    while j < n:
-        k = min(int((col + j) * scale), last)
-        end = n if k == last else min(n, int((k + 1) / scale) + 1 - col)
-        end = max(end, j + 1)
-        slope = (nodes[k + 1] - nodes[k]) * scale
-        begin, step = _f(nodes[k] + slope * (col + j - k / scale)), _f(slope)
-        target = out[j:end]
-        for i in range(end - j):
-            target[i] = begin + step * _f(i)
-        j = end
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _start(phase, order, n, absolute, chi2, margin2):
-    for j in range(n):
-        absolute[j] = phase[j] + order
-        chi2[j] = _ZERO
-        margin2[j] = _INF
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _step(coarse, phase, fine, systematic2, ratio, n, absolute, chi2, margin2):
-    """One set finer; `coarse` and `fine` are the variances of both sets' phases, which share a systematic error."""
-    for j in range(n):
-        a, rest, m = follow(absolute[j], coarse[j] + systematic2, phase[j], fine[j] + systematic2, ratio)
-        absolute[j] = a
-        chi2[j] += rest
-        least = margin2[j]
-        margin2[j] = m if m < least else least
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _accept(absolute, bounds, n, best):
-    """The one order that comes into question, where it lies in the bounds."""
-    lo, hi = bounds[0], bounds[1]
-    for j in range(n):
-        a = absolute[j]
-        best[j] = a if (a >= lo[j]) & (a <= hi[j]) else _NAN
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _consider(absolute, chi2, margin2, bounds, unexpected, n, best, best_chi2, second, best_margin2):
-    """Keep the order if it lies in the bounds and fits better; remember how well the next best fits."""
-    lo, hi, soft_lo, soft_hi = bounds[0], bounds[1], bounds[2], bounds[3]
-    for j in range(n):
-        a = absolute[j]
-        cost = chi2[j] + (unexpected if (a < soft_lo[j]) | (a > soft_hi[j]) else _ZERO)
-        cost = cost if (a >= lo[j]) & (a <= hi[j]) else _INF
-        first, next_best, margin, so_far = best_chi2[j], second[j], best_margin2[j], best[j]
-        better = cost < first
-        other = next_best if next_best < cost else cost
-        second[j] = first if better else other
-        best_margin2[j] = margin2[j] if better else margin
-        best[j] = a if better else so_far
-        best_chi2[j] = cost if better else first
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _margin(best_chi2, second, best_margin2, n, margin2):
-    for j in range(n):
-        apart, m = second[j] - best_chi2[j], best_margin2[j]
-        margin2[j] = apart if apart < m else m
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _candidates(phase, lo, hi, per_turn, slack, n):
-    """First and last order of the coarsest set that any pixel of the block may have; none: last < first."""
-    first, last = _FAR, -_FAR
-    for j in range(n):
-        some = lo[j] <= hi[j]
-        a = np.int32(np.ceil(lo[j] * per_turn - phase[j] - slack))
-        b = np.int32(np.floor(hi[j] * per_turn - phase[j] + slack))
-        a, b = a if some else _FAR, b if some else -_FAR
-        first = a if a < first else first
-        last = b if b > last else last
-    return first, last
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _judge(variance, background, modulation, coarse_modulation, rough, usual, absolute, margin2, limits, n, sigma,
-           reasons):  # fmt: skip
-    """Reason bits of unsaturated pixels: exposure (III-D 1), order, consistency; and sigma, turns, from its square."""
-    for j in range(n):
-        a, b, v = background[j], modulation[j], variance[j]
-        s = math.sqrt(v)
-        sigma[j] = s
-        dark = a < limits.background
-        low = _low(a, b, limits)
-        torn = rough[j] > _ZERO
-        fine = b * (_ONE + _TWO * TWO_PI * s) < limits.fine_modulation * usual[j] * coarse_modulation[j]
-        weak = (s > limits.sigma) | fine
-        low = low | (weak & (not dark) & (not torn))
-        none = absolute[j] != absolute[j]
-        certain = margin2[j] >= limits.margin
-        r = limits.dark if dark else 0
-        r |= limits.low_modulation if low else 0
-        r |= limits.inconsistent if torn else 0
-        r |= (limits.outside if s < _INF else 0) if none else (0 if certain else limits.uncertain)
-        reasons[j] = r
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _all_dark(background, n, least):
-    lit = np.uint32(0)
-    for j in range(n):
-        lit |= np.uint32(0) if background[j] < least else np.uint32(1)
-    return lit == 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _leave_dark(background, modulation, limits, n, reasons):
-    """Reason bits of a block of dark pixels: dark, and low modulation where it is."""
-    for j in range(n):
-        reasons[j] = limits.dark | (limits.low_modulation if _low(background[j], modulation[j], limits) else 0)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _low(a, b, limits):
-    """Whether modulation b is too low for background a and its noise."""
-    w = limits.noise_a + limits.noise_b * a
-    noise2 = w if w > _f(ROUNDING) else _f(ROUNDING)
-    low = (b < limits.modulation) | (b < limits.contrast * a)
-    return low | (b * b < limits.modulation_sigma * limits.modulation_sigma * noise2)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
-def _clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulation, used):
+def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulation, used):
     """A pixel with saturated samples, by the scalar way, in float64: its reasons, phase, sigma, A, B of the finest set.
 
     `phase` .. `modulation` (K, 1, 1) and `used` (K, 2) are scratch. A coarse set of two samples borrows the background
@@ -427,8 +205,8 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
         slack += _f(sets.frequency[0] / sets.frequency[k])
     slack = _HALF * slack + _f(0.01)
     for i in range(first, last):
-        _rows_between(bounds, i, height, limit_row)
-        _row_between(usual, i, height, usual_row)
+        rows_between(bounds, i, height, limit_row)
+        row_between(usual, i, height, usual_row)
         row_cubics(depths.table, i, depths.step, row)
         for col in range(0, W, BLOCK):
             n = min(BLOCK, W - col)
@@ -448,30 +226,30 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
             for j in range(n):
                 brightest = max(brightest, top[j])
             dark = False
-            for back_to_front in range(K):  # the finest set first: where it is dark all over, nothing else is worked out
+            for back_to_front in range(K):  # the finest set first: where it is dark all over, that is all
                 k = K - 1 - back_to_front
                 a, b = sets.start[k], sets.start[k + 1]
                 pivot = sets.pivot
                 if b - a == 4 and sets.plain[k]:
-                    _four(x, a, n, acc)
+                    four(x, a, n, acc)
                     pivot = _ZERO
                 elif b - a == 8 and sets.plain[k]:
-                    _eight(x, a, n, acc)
+                    eight(x, a, n, acc)
                     pivot = _ZERO
                 else:
-                    _sums(x, a, b, sets.cos, sets.sin, pivot, n, acc)
-                _fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k],
+                    sums(x, a, b, sets.cos, sets.sin, pivot, n, acc)
+                fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k],
                      back if k == K - 1 else other, mod[k], rough)  # fmt: skip
                 if k == K - 1 and brightest < sets.top:
-                    dark = _all_dark(back, n, limits.background)
+                    dark = all_dark(back, n, limits.background)
                 if dark:
                     break
             if dark:
-                _leave_dark(back, mod[K - 1], limits, n, bits)
+                leave_dark(back, mod[K - 1], limits, n, bits)
                 point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
                 out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
-                out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
-                b, fine_2 = mod[K - 1], own[K - 1]
+                out_a, out_b = background[i, col : col + n], modulation[i, col : col + n]
+                out_r, b, fine_2 = reasons[i, col : col + n], mod[K - 1], own[K - 1]
                 for j in range(n):
                     along[j] = point[j, 0] = point[j, 1] = point[j, 2] = out_phase[j] = _NAN
                 for j in range(n):
@@ -481,32 +259,32 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
                     out_r[j] = bits[j]
                 continue
             for m in range(2):
-                _ramp(limit_row[m], limit_scale, col, n, limit[m])
-            _ramp(usual_row, usual_scale, col, n, around)
-            low, high = _candidates(wrapped[0], limit[0], limit[1], per_turn, slack, n)
+                ramp(limit_row[m], limit_scale, col, n, limit[m])
+            ramp(usual_row, usual_scale, col, n, around)
+            low, high = candidates(wrapped[0], limit[0], limit[1], per_turn, slack, n)
             if low != high or brightest >= sets.top:
                 for m in range(2, 4):
-                    _ramp(limit_row[m], limit_scale, col, n, limit[m])
+                    ramp(limit_row[m], limit_scale, col, n, limit[m])
             if low != high:
                 for j in range(n):
                     best[j] = _NAN
                     best_chi2[j] = second[j] = best_margin2[j] = _INF
             for order in range(low, high + 1):
-                _start(wrapped[0], _f(order), n, absolute, chi2, margin2)
+                coarsest(wrapped[0], _f(order), n, absolute, chi2, margin2)
                 for k in range(1, K):
-                    _step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
+                    step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
                 if low == high:
-                    _accept(absolute, limit, n, best)
+                    accept(absolute, limit, n, best)
                 else:
-                    _consider(absolute, chi2, margin2, limit, limits.unexpected, n, best, best_chi2, second,
+                    consider(absolute, chi2, margin2, limit, limits.unexpected, n, best, best_chi2, second,
                               best_margin2)  # fmt: skip
             if low != high:
-                _margin(best_chi2, second, best_margin2, n, margin2)
+                order_margin(best_chi2, second, best_margin2, n, margin2)
             b = mod[K - 1]
-            _judge(own[K - 1], back, b, mod[max(K - 2, 0)], rough, around, best, margin2, limits, n, fine, bits)
+            judge(own[K - 1], back, b, mod[max(K - 2, 0)], rough, around, best, margin2, limits, n, fine, bits)
             for j in range(n if brightest >= sets.top else 0):
                 if top[j] >= sets.top:
-                    bits[j], best[j], fine[j], back[j], b[j] = _clipped_pixel(
+                    bits[j], best[j], fine[j], back[j], b[j] = clipped_pixel(
                         x, j, sets, limits, limit, one[0], one[1], one[2], one[3], used
                     )
             lost = ~limits.uncertain
@@ -532,21 +310,3 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
                 out_a[j] = back[j]
                 out_b[j] = b[j]
                 out_r[j] = bits[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _row_between(nodes, i, height, out):
-    """Row i of a picture of `height` rows from nodes (h, w) that span it corner on corner."""
-    h = nodes.shape[0]
-    y = i * (h - 1) / max(height - 1, 1)
-    y0 = min(int(y), max(h - 2, 0))
-    y1 = min(y0 + 1, h - 1)
-    fy = y - y0
-    for c in range(nodes.shape[1]):
-        out[c] = (1.0 - fy) * nodes[y0, c] + fy * nodes[y1, c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _rows_between(nodes, i, height, out):
-    for m in range(nodes.shape[0]):
-        _row_between(nodes[m], i, height, out[m])

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numba.extending import overload
 
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1.0 / 12.0  #: least variance of a sample, codes squared
@@ -19,6 +20,16 @@ _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
 )  # fmt: skip
 _ZERO, _QUARTER, _HALF, _ONE, _TWO, _THREE, _FOUR = (np.float32(c) for c in (0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0))
 _TINY = np.float32(1e-30)
+
+
+def whole(x):
+    """The greatest whole number that is not above x, in x's type; each target has its own way (see `gpu.py`)."""
+    return np.floor(x)
+
+
+@overload(whole, inline="always", target="cpu")
+def _whole(x):  # noqa: ARG001
+    return lambda x: np.floor(x)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -61,7 +72,7 @@ def follow(absolute, variance, phase, fine_variance, ratio):
     The margin: how many standard deviations worse the next turn would fit, squared.
     """
     predicted = absolute * ratio
-    n = np.floor(predicted - phase + _HALF)
+    n = whole(predicted - phase + _HALF)
     rest = predicted - phase - n
     weight = _ONE / (variance * (ratio * ratio) + fine_variance)
     return phase + n, rest * rest * weight, (_ONE - _TWO * abs(rest)) * weight

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, response, triangulate
-from fringescope.errors import CalibrationError, CaptureError, EmptyResultError
+from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
 from fringescope.pipeline import fast
+from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
 from fringescope.types import (
     F32,
@@ -58,14 +59,18 @@ def measured_view(view: ViewInput, s: Settings) -> Decoded:
     return response.corrected(phase.measure(view.frames, view.plan, s.phase, view.noise), view.response)
 
 
-def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
+def scan_view(view: ViewInput, rig: Rig, s: Settings, *, device: Device = "cpu") -> tuple[Decoded, Grid]:
     """One camera's frames to organised points with sigma (Fig. 6, with the masks of Fig. 7).
 
-    Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do.
+    `device="gpu"` decodes and triangulates on an NVIDIA GPU, equal within float32's rounding; masks stay here. A plan
+    that the fused way does not take goes through the stages, here as well, and a note of the view says so.
+    Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do; UsageError where
+    there is no such device.
     """
+    check_device(device)
     geometry.check_baseline(rig, rig.camera(view.plan.camera))
     view = replace(view, frames=list(view.frames))
-    fused = fast.decode(view, rig, s)  # the same in one pass, for the usual plans
+    fused = fast.decode(view, rig, s, device)  # the same in one pass, for the usual plans
     if fused is not None:
         decoded, xyz, sigma, steps = fused
         tiles = denoise.Tiles(decoded, (steps,))
@@ -73,8 +78,22 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings) -> tuple[Decoded, Grid]:
         grid = triangulate.blanked(xyz, sigma, reasons, rig, decoded.camera)
     else:
         decoded = clean_view(view, rig, s)
+        if device == "gpu":
+            decoded = replace(decoded, notes=(*decoded.notes, "not on the GPU: a plan for the stages"))
         grid = _points(decoded, rig, s)  # equations 8 to 15
     return phase.with_reasons(decoded, grid.reasons), grid
+
+
+def check_device(device: str) -> Device:
+    """`cpu` or `gpu`, where frames become points. Raises UsageError for others, and where there is no GPU to use."""
+    if device == "gpu":
+        from fringescope.pipeline import gpu  # CUDA is nobody's business who does not ask for it
+
+        gpu.require()
+        return "gpu"
+    if device != "cpu":
+        raise UsageError(f"device '{device}'; needed cpu or gpu")
+    return "cpu"
 
 
 def clean_view(view: ViewInput, rig: Rig, s: Settings) -> Decoded:
@@ -270,13 +289,14 @@ def scan(
     *,
     all_points: bool = False,
     surface: bool = True,
+    device: Device = "cpu",
     progress: Progress | None = None,
 ) -> Scan:
     """Fringe images of all views to one clean, coloured surface.
 
     `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Where the
-    points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. Raises
-    EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
+    points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. `device`:
+    see `scan_view`. Raises EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
     tell = progress or _silent
@@ -288,7 +308,7 @@ def scan(
     for n, view in enumerate(views):
         tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
         start = perf_counter()
-        decoded, grid = scan_view(view, rig, s)
+        decoded, grid = scan_view(view, rig, s, device=device)
         grids.append(grid)
         photos.append(picture(view, decoded, s))
         times[f"scan_view {grid.camera}"] = perf_counter() - start

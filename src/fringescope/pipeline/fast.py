@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -36,13 +36,15 @@ from fringescope.types import (
     ViewPlan,
 )
 
+Device = Literal["cpu", "gpu"]  #: where the fused kernel runs
+
 MOST_ERROR_MM = 1e-4  #: of the depth table against the exact solution
 TWO_PI = 2 * np.pi
 f4 = np.float32
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class Way:
     """What the kernel needs to know of a view: its frames in the order of its sets, coarse to fine, and the tables."""
 
     frames: tuple[AnyArray, ...]
@@ -66,19 +68,27 @@ class Fused(NamedTuple):
     steps: F32
 
 
-def decode(view: ViewInput, rig: Rig, s: Settings) -> Fused | None:
+def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> Fused | None:
     """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
-    in one pass; None for a view that the fused kernel does not take.
+    in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
     `view.frames` must be a sequence. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
     """
-    way = _way(view, rig, s)
+    way = way_of(view, rig, s)
     if way is None:
         return None
     H, W = way.frames[0].shape
     absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
     reasons, xyz = memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32)
-    _by_rows(way, (absolute, sigma, A, B, reasons, xyz, sigma_mm))
+    out = (absolute, sigma, A, B, reasons, xyz, sigma_mm)
+    if device == "gpu":
+        from fringescope.pipeline import gpu  # only then: Numba's CUDA is slow to import
+
+        if not gpu.takes(way.sets):
+            return None
+        gpu.by_slabs(way.frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
+    else:
+        on_cpu(way, out)
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -91,7 +101,7 @@ def decode(view: ViewInput, rig: Rig, s: Settings) -> Fused | None:
 
 
 def _points_again(
-    decoded: Decoded, rows: AnyArray, columns: AnyArray, way: _Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
+    decoded: Decoded, rows: AnyArray, columns: AnyArray, way: Way, rig: Rig, s: Settings, xyz: F32, sigma_mm: F32
 ) -> None:
     """Points of the pixels whose order the vote has changed, by the same table in float64."""
     moved = rows, columns
@@ -113,7 +123,8 @@ def _points_again(
     decoded.reasons[moved] = np.where(inside, decoded.reasons[moved] & ~bit, decoded.reasons[moved] | bit)
 
 
-def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
+def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
+    """What the kernel needs to know of a view; None for one that it does not take."""
     plan, camera = view.plan, rig.camera(view.plan.camera)
     family = _parallel(plan)
     frames = _in_order(view, family) if family else None
@@ -152,7 +163,7 @@ def _way(view: ViewInput, rig: Rig, s: Settings) -> _Way | None:
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
     limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
     depths = _depths(table, rig, camera, s)
-    return _Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
+    return Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
 def _parallel(plan: ViewPlan) -> list[tuple[int, tuple[float, float]]] | None:
@@ -236,7 +247,7 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
     )
 
 
-def _by_rows(way: _Way, out: tuple[AnyArray, ...]) -> None:
+def on_cpu(way: Way, out: tuple[AnyArray, ...]) -> None:
     """Runs the kernel over rows on all cores; it reads the frames where they lie."""
     frames = [f if f.strides[1] == f.itemsize else np.ascontiguousarray(f) for f in way.frames]
     addresses = np.array([f.ctypes.data for f in frames], np.int64)
