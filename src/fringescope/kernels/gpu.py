@@ -205,10 +205,10 @@ def decode_pixel(band, i, j, sets, limits, rows, depths, wrapped, variance):
             )  # fmt: skip
     at, t = _place(j, W, rows.usual.shape[1])
     usual = _between(rows.usual[row], at, t)
-    apart, own = second - best_chi2, math.sqrt(own)
+    apart, sigma = second - best_chi2, math.sqrt(own)
     margin2 = apart if apart < best_margin2 else best_margin2
-    reasons = judged(a, b, coarse_b, own, rough, usual, best, margin2, limits)
-    _finish(band, i, j, depths, rows.cubics[row], best, own, a, b, reasons, limits)
+    reasons = judged(a, b, coarse_b, sigma, rough, usual, best, margin2, limits)
+    _finish(band, i, j, depths, rows.cubics[row], best, sigma, a, b, reasons, limits)
 
 
 @njit(cache=True, error_model="numpy")
