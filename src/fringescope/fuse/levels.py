@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ _FIRST = 0.8  # share of the inner vertices that a lattice gives; the others go 
 _NOISE = 0.3  # a vertex one of its own residuals off its neighbours is worth this share of it less
 _FLAT = 1.0  # of the median bend: below it cells grow no further
 _FINEST = 60  # cells are at most this many times the square root of 2 smaller than the largest
+_TRIES = 5  # at a lattice with as many cells as are wanted
+_SHORT = 0.01  # share of the cells by which a try aims lower
 _CENTRED = 2.0  # what half a cell off its middle costs a point of the lattice, in residuals of the usual size
 
 
@@ -115,23 +118,35 @@ def _side(m: _Measures, count: float) -> float:
 
 
 def _lattice(m: _Measures, count: int) -> Bool:
-    """Nearly `count` of the inner points (n,), one in each cell of a lattice: quiet ones near the cell's middle."""
+    """Nearly `count` of the inner points (n,), one in each cell of a lattice: quiet ones near the cell's middle.
+
+    How many cells have points is found by trying; it grows nearly as a power of how many are wanted.
+    """
     n = len(m.sheet.ab)
     size = 1 << max(4, int(2 * len(m.at) - 1).bit_length())
     keys, best = np.empty(size, np.int64), np.full(size, -1, np.int32)
     shrink = np.exp2(-np.arange(_FINEST + 1) / 2.0)
-    wanted, chosen = float(count), m.inner
-    for _ in range(4):
+    wanted, power = 0.5 * count, 0.8
+    most, out = 0, np.zeros(n, np.bool_)
+    before: tuple[float, float] | None = None
+    for _ in range(_TRIES):
         chosen = np.zeros(n, np.bool_)
         sides = np.maximum(_side(m, wanted) * shrink, 1.0)
         cells = k.best_of_cells(m.sheet.ab, m.at, m.step, sides, m.low, m.quiet, np.float32(_CENTRED), keys, best, chosen)
-        if cells <= count:
-            return chosen
-        wanted *= 0.97 * count / cells
-    at = np.flatnonzero(chosen)
-    chosen = np.zeros(n, np.bool_)
-    chosen[at[np.linspace(0, len(at) - 1, count).astype(np.int64)]] = True
-    return chosen
+        if most < cells <= count or most == 0 or most > count:
+            most, out = cells, chosen
+        if (1 - 2 * _SHORT) * count <= cells <= count or cells == len(m.at):
+            break
+        now = math.log(wanted), math.log(cells)
+        if before is not None and now[0] != before[0]:
+            power = min(max((now[1] - before[1]) / (now[0] - before[0]), 0.4), 1.0)
+        before = now
+        wanted *= ((1 - _SHORT) * count / cells) ** (1 / power)
+    if most > count:
+        at = np.flatnonzero(out)
+        out = np.zeros(n, np.bool_)
+        out[at[np.linspace(0, most - 1, count).astype(np.int64)]] = True
+    return out
 
 
 def _missed(simplices: I32, neighbours: I32, m: _Measures, chosen: Bool, count: int) -> I64:
@@ -166,8 +181,7 @@ def _kept(simplices: I32, neighbours: I32, m: _Measures) -> I32:
     tells, or else its middle.
     """
     sheet = m.sheet
-    keep = np.empty(len(simplices), np.bool_)
-    k.any_of(simplices, m.inner, keep)
+    keep = m.inner[simplices[:, 0]] | m.inner[simplices[:, 1]] | m.inner[simplices[:, 2]]
     ask = np.flatnonzero(~keep)
     middle = sheet.ab[simplices[ask]].mean(axis=1)
     inside = np.empty(len(middle), np.int64)

@@ -61,7 +61,7 @@ def sort_by(key, bits, order):
         order[i] = target[i]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def side(xy, a, b, c):
     """Twice the area of the triangle a, b, c: positive where c lies left of the way from a to b. Exact."""
     return (xy[b, 0] - xy[a, 0]) * (xy[c, 1] - xy[a, 1]) - (xy[b, 1] - xy[a, 1]) * (xy[c, 0] - xy[a, 0])
@@ -95,7 +95,7 @@ def _tie(xy, a, b, c, d):
     return _before(xy, one, two)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def within(xy, a, b, c, d):
     """Whether d lies within the circle through a, b, c (counter-clockwise, none at infinity). Exact."""
     ax, ay = xy[a, 0] - xy[d, 0], xy[a, 1] - xy[d, 1]
@@ -112,7 +112,7 @@ def within(xy, a, b, c, d):
     return sign > 0 or (sign == 0 and _tie(xy, a, b, c, d))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _wrong(xy, p, a, b, d):
     """Whether the edge a b of the triangle p, a, b must go, d beyond it. At most one of a, b, d is at infinity."""
     if d < 0:
@@ -124,7 +124,7 @@ def _wrong(xy, p, a, b, d):
     return within(xy, p, a, b, d)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _triangle(net, t, a, b, c, x, y, z):
     """Write a triangle and what lies across its edges, and tell those."""
     net[t], net[t + 1], net[t + 2] = a, b, c

@@ -114,13 +114,6 @@ def plane_areas(first, last, faces, ab, out):
 
 
 @by_rows(lambda faces, *_: faces.shape[0])
-def any_of(first, last, faces, there, out):
-    """Whether (m,) a corner of each triangle is `there` (n,)."""
-    for f in range(first, last):
-        out[f] = there[faces[f, 0]] or there[faces[f, 1]] or there[faces[f, 2]]
-
-
-@by_rows(lambda faces, *_: faces.shape[0])
 def towards(first, last, faces, xyz, centre, out, area):
     """The triangles (m, 3) with their corners counter-clockwise as seen from `centre` (3,), and whether they have area.
 
@@ -297,8 +290,8 @@ def best_of_cells(ab, at, step, sides, low, quiet, centred, keys, best, chosen):
     """Choose one of the points `at` (k,) in each cell: the least `quiet` (k,) plus `centred` times its offset squared.
 
     Cells are squares of `sides[step]` from `low` (2,), a lattice for each `step` (k,); the offset is 0 in the middle of
-    a cell, 1 at its edge. `keys`, `best` are a hash table, more entries than points and a power of two, `best` -1
-    throughout before and after. Sets `chosen` (n,) and returns the number of cells.
+    a cell, 1 at its edge. `keys`, `best` are a hash table, more entries than points and a power of
+    two, at least 16; `best` -1 throughout before and after. Sets `chosen` (n,) and returns the number of cells.
     """
     mask = keys.shape[0] - 1
     count = 0
@@ -310,9 +303,10 @@ def best_of_cells(ab, at, step, sides, low, quiet, centred, keys, best, chosen):
         off = 2.0 * max(abs(x - column - 0.5), abs(y - row - 0.5))
         score[i] = quiet[i] + centred * off * off
         key = (np.int64(step[i]) << 54) | (row << 27) | column
-        slot = ((key ^ (key >> 29)) * -7046029254386353131 >> 20) & mask
+        tile = (key >> 2) & ~(np.int64(3) << 25)  # 4 x 4 cells lie beside each other in the table
+        slot = ((tile ^ (tile >> 23)) * -7046029254386353131 >> 40) & mask & ~15 | (row & 3) << 2 | column & 3
         while best[slot] >= 0 and keys[slot] != key:
-            slot = (slot + 1) & mask
+            slot = (slot + 17) & mask
         if best[slot] < 0:
             keys[slot] = key
             best[slot] = i
