@@ -198,17 +198,15 @@ def test_best_of_cells_equals_a_dictionary(seed):
     at = np.sort(rng.permutation(n)[: rng.integers(1, n + 1)])
     step, quiet = rng.integers(0, 4, len(at)).astype(np.int32), rng.random(len(at)).astype(np.float32)
     sides = 2.0 ** rng.uniform(18, 24) / np.sqrt(2.0) ** np.arange(4)
-    low = ab[at].min(axis=0)
     best = {}
     for i, p in enumerate(at):
-        place = (ab[p] - low) / sides[step[i]]
+        place = ab[p] / sides[step[i]]
         off = 2 * np.abs(place - np.floor(place) - 0.5).max()
         key = (step[i], *np.floor(place))
         best[key] = min(best.get(key, (np.inf, 0)), (np.float32(quiet[i] + np.float32(2) * off * off), p))
     size = 1 << max(4, int(2 * len(at)).bit_length())
     table, chosen = np.full(size, -1, np.int32), np.zeros(n, bool)
-    count = mesh_kernels.best_of_cells(ab, at, step, sides, low, quiet, np.float32(2), np.empty(size, np.int64), table,
-                                       chosen)
+    count = mesh_kernels.best_of_cells(ab, at, step, sides, quiet, np.float32(2), np.empty(size, np.int64), table, chosen)
     assert count == len(best)
     assert (table == -1).all()
     assert set(np.flatnonzero(chosen)) == {p for _, p in best.values()}

@@ -138,7 +138,7 @@ def test_a_preview_alone_is_a_surface_too(on_ball):
 
 
 def test_levels_share_their_pictures(on_ball):
-    _, _, fused, _, levels = on_ball
+    *_, levels = on_ball
     textures = {p.view: p.texture for p in levels[0].parts}
     assert all(p.texture is textures[p.view] for p in levels[1].parts)
     assert all(p.texture.flags.c_contiguous for level in levels for p in level.parts)

@@ -23,19 +23,19 @@ def snapped(ab: AnyArray) -> F64:
     That is a part in 16 million of the larger side or finer. Points that fall on each other are one.
     Raises UsageError for coordinates that are not finite.
     """
-    if not np.isfinite(ab).all():
+    if not np.isfinite(ab.sum()) and not np.isfinite(ab).all():
         bad = int((~np.isfinite(ab).all(axis=1)).sum())
         raise UsageError(f"{bad} of {len(ab)} points have no coordinates; needed finite numbers")
     if not len(ab):
         return np.zeros((0, 2))
-    low = ab.min(axis=0)
-    size = float((ab.max(axis=0) - low).max())
+    low = np.array([ab[:, 0].min(), ab[:, 1].min()])
+    size = float(max(ab[:, 0].max() - low[0], ab[:, 1].max() - low[1]))
     scale = 2.0 ** math.floor(math.log2((k.SIDE - 1) / size)) if size > 0.0 else 1.0
     return np.asarray(np.rint((ab - low) * scale), dtype=np.float64)
 
 
 def along_curve(ab: F64) -> I64:
-    """Indices (n,) of snapped points in order along a Hilbert curve: neighbours in the plane mostly follow each other."""
+    """Indices (n,) of snapped points in order along a Hilbert curve: what follows each other lies near each other."""
     key = np.empty(len(ab), np.int64)
     order = np.empty(len(ab), np.int64)
     k.hilbert(ab, _BITS, key)

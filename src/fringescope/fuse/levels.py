@@ -18,6 +18,7 @@ from fringescope.types import F32, F64, I32, Bool
 I64 = NDArray[np.int64]
 
 _FIRST = 0.8  # share of the inner vertices that a lattice gives; the others go where it misses the surface
+_ROUNDS = 2  # in which these are found
 _NOISE = 0.3  # a vertex one of its own residuals off its neighbours is worth this share of it less
 _FLAT = 1.0  # of the median bend: below it cells grow no further
 _FINEST = 60  # cells are at most this many times the square root of 2 smaller than the largest
@@ -66,7 +67,6 @@ class _Measures:
     at: I64
     inner: Bool  #: (n,) the same as `at`
     rings: tuple[I32, I32]
-    low: F64
     area: float
     step: I32
     quiet: F32
@@ -101,8 +101,7 @@ def _measures(sheet: Sheet) -> _Measures:
         step = np.minimum(np.rint(np.log2(np.maximum(bend, 1))), _FINEST).astype(np.int32)
     area = np.empty(len(faces), np.float64)
     k.plane_areas(faces, sheet.ab, area)
-    low = sheet.ab[at].min(axis=0) if len(at) else np.zeros(2)
-    return _Measures(sheet, at, inner, rings, low, float(area.sum()), step, quiet)
+    return _Measures(sheet, at, inner, rings, float(area.sum()), step, quiet)
 
 
 def _side(m: _Measures, count: float) -> float:
@@ -132,7 +131,7 @@ def _lattice(m: _Measures, count: int) -> Bool:
     for _ in range(_TRIES):
         chosen = np.zeros(n, np.bool_)
         sides = np.maximum(_side(m, wanted) * shrink, 1.0)
-        cells = k.best_of_cells(m.sheet.ab, m.at, m.step, sides, m.low, m.quiet, np.float32(_CENTRED), keys, best, chosen)
+        cells = k.best_of_cells(m.sheet.ab, m.at, m.step, sides, m.quiet, np.float32(_CENTRED), keys, best, chosen)
         if most < cells <= count or most == 0 or most > count:
             most, out = cells, chosen
         if (1 - 2 * _SHORT) * count <= cells <= count or cells == len(m.at):
@@ -173,7 +172,7 @@ def _missed(simplices: I32, neighbours: I32, m: _Measures, chosen: Bool, count: 
     return np.sort(at[best])
 
 
-def _kept(simplices: I32, neighbours: I32, m: _Measures) -> I32:
+def _kept(simplices: I32, m: _Measures) -> I32:
     """The triangles of a level that lie on the sheet.
 
     An edge of a Delaunay triangulation stays one when other points go. All ends of the sheet's border stay, hence so
@@ -198,9 +197,13 @@ def _level(m: _Measures, triangles: int) -> I32:
     missing = count - int(np.count_nonzero(chosen))
     border = np.flatnonzero(chosen | sheet.border)
     made = Triangulation(sheet.ab, border, len(border) + max(missing, 0))
-    if missing > 0:
-        made.add(_missed(*made.triangles(), m, chosen, missing))
-    return _kept(*made.triangles(), m)
+    for left in range(_ROUNDS, 0, -1):
+        if missing > 0:
+            more = _missed(*made.triangles(), m, chosen, -(-missing // left))
+            chosen[more] = True
+            missing -= len(more)
+            made.add(more)
+    return _kept(made.triangles()[0], m)
 
 
 def removable(sheet: Sheet, triangles: int) -> bool:

@@ -230,7 +230,7 @@ def surface(fused: Fused, rig: Rig, s: MeshSettings | None = None) -> tuple[Surf
 
 
 def preview(fused: Fused, rig: Rig, s: MeshSettings | None = None) -> Surface:
-    """The level of at most `preview_triangles` alone, sooner than `surface` makes it, from no more points than it needs.
+    """The level of at most `preview_triangles` alone, made sooner and from fewer points than by `surface`.
 
     Denser clouds are strided to about two points per triangle, so the border is coarser than that of `surface`.
     As `surface` otherwise.

@@ -226,7 +226,7 @@ def insert(xy, at, net, used, near, skip_j, skip_k):
         for i in range(0, n, step):
             if outer > 0 and i % outer == 0:
                 continue
-            if skip_j >= 0 and (i == 0 or i == skip_j or i == skip_k):
+            if skip_j >= 0 and i in (0, skip_j, skip_k):
                 continue
             used, near = _put(xy, net, used, at[i], near)
         outer, step = step, step // _ROUND

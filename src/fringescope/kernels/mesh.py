@@ -214,7 +214,7 @@ def ring_mean(first, last, faces, start, around, value, out):
 
 @by_rows(lambda *args: args[-1].shape[0])
 def residuals(first, last, faces, start, around, xyz, normal, out):
-    """Distance (n,) along its normal from the mean of the corners around each vertex to the vertex, mm; 0 without any."""
+    """Distance (n,) along its normal from the mean of the corners around each vertex to the vertex, mm; 0 without."""
     for v in range(first, last):
         x, y, z = 0.0, 0.0, 0.0
         for k in range(start[v], start[v + 1]):
@@ -286,10 +286,10 @@ def best_of_each(group, score, best):
 
 
 @njit(cache=True, nogil=True)
-def best_of_cells(ab, at, step, sides, low, quiet, centred, keys, best, chosen):
+def best_of_cells(ab, at, step, sides, quiet, centred, keys, best, chosen):
     """Choose one of the points `at` (k,) in each cell: the least `quiet` (k,) plus `centred` times its offset squared.
 
-    Cells are squares of `sides[step]` from `low` (2,), a lattice for each `step` (k,); the offset is 0 in the middle of
+    Cells are squares of `sides[step]`, a lattice for each `step` (k,); the offset is 0 in the middle of
     a cell, 1 at its edge. `keys`, `best` are a hash table, more entries than points and a power of
     two, at least 16; `best` -1 throughout before and after. Sets `chosen` (n,) and returns the number of cells.
     """
@@ -298,7 +298,7 @@ def best_of_cells(ab, at, step, sides, low, quiet, centred, keys, best, chosen):
     score = np.empty(at.shape[0], np.float32)
     for i in range(at.shape[0]):
         s = sides[step[i]]
-        x, y = (ab[at[i], 0] - low[0]) / s, (ab[at[i], 1] - low[1]) / s
+        x, y = ab[at[i], 0] / s, ab[at[i], 1] / s
         column, row = np.int64(x), np.int64(y)
         off = 2.0 * max(abs(x - column - 0.5), abs(y - row - 0.5))
         score[i] = quiet[i] + centred * off * off
