@@ -206,7 +206,8 @@ def test_best_of_cells_equals_a_dictionary(seed):
         best[key] = min(best.get(key, (np.inf, 0)), (np.float32(quiet[i] + np.float32(2) * off * off), p))
     size = 1 << max(4, int(2 * len(at)).bit_length())
     table, chosen = np.full(size, -1, np.int32), np.zeros(n, bool)
-    count = mesh_kernels.best_of_cells(ab, at, step, sides, quiet, np.float32(2), np.empty(size, np.int64), table, chosen)
+    keys = np.empty(size, np.int64)
+    count = mesh_kernels.best_of_cells(ab, at, step, sides, quiet, np.float32(2), keys, table, chosen)
     assert count == len(best)
     assert (table == -1).all()
     assert set(np.flatnonzero(chosen)) == {p for _, p in best.values()}
