@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -186,17 +187,23 @@ def _parts(faces: I32, p: _Points, fused: Fused, rig: Rig) -> list[_Part]:
     return out
 
 
+def _crop(view: int, uv: Sequence[F64], fused: Fused) -> tuple[NDArray[np.int_], NDArray[np.int_], U8]:
+    """The part of a picture in which the points `uv` lie: first pixel (x, y), the one after the last, and a copy."""
+    H, W = fused.grids[view].sigma.shape
+    low = np.floor(np.min([[x[:, 0].min(), x[:, 1].min()] for x in uv], axis=0)).astype(int) - _MARGIN
+    high = np.ceil(np.max([[x[:, 0].max(), x[:, 1].max()] for x in uv], axis=0)).astype(int) + _MARGIN + 1
+    low, high = np.maximum(low, 0), np.minimum(high, [W, H])
+    return low, high, np.ascontiguousarray(fused.pictures[view][low[1] : high[1], low[0] : high[0]])
+
+
 def _assemble(levels: Sequence[I32], p: _Points, fused: Fused, rig: Rig) -> tuple[Surface, ...]:
     """Surfaces with the used part of each view's picture, which the levels share."""
     cut = [_parts(faces, p, fused, rig) for faces in levels]
-    crop = {}
-    for v in {part.view for parts in cut for part in parts}:
-        uv = [part.uv for parts in cut for part in parts if part.view == v]
-        H, W = fused.grids[v].sigma.shape
-        low = np.floor(np.min([[x[:, 0].min(), x[:, 1].min()] for x in uv], axis=0)).astype(int) - _MARGIN
-        high = np.ceil(np.max([[x[:, 0].max(), x[:, 1].max()] for x in uv], axis=0)).astype(int) + _MARGIN + 1
-        low, high = np.maximum(low, 0), np.minimum(high, [W, H])
-        crop[v] = low, high, np.ascontiguousarray(fused.pictures[v][low[1] : high[1], low[0] : high[0]])
+    places: dict[int, list[F64]] = {}
+    for part in (part for parts in cut for part in parts):
+        places.setdefault(part.view, []).append(part.uv)
+    with ThreadPoolExecutor(max(len(places), 1)) as pool:
+        crop = dict(zip(places, pool.map(lambda v: _crop(v, places[v], fused), places), strict=True))
     out = []
     for faces, parts in zip(levels, cut, strict=True):
         used = _marked(faces, len(p.xyz))
