@@ -3,8 +3,10 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import Delaunay
 
 from fringescope import geometry
+from fringescope.fuse import mesh
 from fringescope.kernels import mesh as mesh_kernels
 from fringescope.kernels import surface as kernels
 from tests import fuse_scenes as scenes
@@ -156,15 +158,98 @@ def test_triangles_equal_their_twin_and_fans_are_counted_right():
     )
 
 
+def neighbours_of(faces):
+    """The triangle across each edge, opposite the corner of the same place; -1 where there is none."""
+    edge = {(f[(c + 1) % 3], f[(c + 2) % 3]): t for t, f in enumerate(faces.tolist()) for c in range(3)}
+    return np.array([[edge.get((f[(c + 2) % 3], f[(c + 1) % 3]), -1) for c in range(3)] for f in faces.tolist()])
+
+
 def test_bow_tie_loses_its_smaller_fan():
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]])
     assert sorted(map(len, reference.fans(faces, 0))) == [1, 2]
-    corner = faces.ravel()
-    order = np.argsort(corner, kind="stable")
-    start = np.searchsorted(corner[order], np.arange(7))
-    drop = np.zeros(3, bool)
-    assert mesh_kernels.bow_ties(faces, start, order // 3, np.empty(9, np.int64), drop) == 1
-    np.testing.assert_array_equal(drop, [False, False, True])
+    leaving, largest, on, keep = np.empty(6, np.int32), np.empty(6, np.int32), np.ones(3, bool), np.ones(3, bool)
+    mesh_kernels.border_edges(faces, neighbours_of(faces), on, leaving)
+    np.testing.assert_array_equal(leaving, [2, 1, 1, 1, 1, 1])
+    assert mesh_kernels.bow_ties(faces, neighbours_of(faces), on, leaving, largest, keep) == 1
+    np.testing.assert_array_equal(keep, [True, True, False])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_left_of_a_torn_sheet_is_a_manifold(seed):
+    rng = np.random.default_rng(seed)
+    d = Delaunay(rng.random((60, 2)))
+    on = rng.random(len(d.simplices)) < 0.6
+    keep = mesh._one_fan(d.simplices, d.neighbors, on, 60)
+    assert not (keep & ~on).any()
+    assert max(len(reference.fans(d.simplices[keep], v)) for v in range(60)) <= 1
+    for t in np.flatnonzero(on & ~keep)[:1]:
+        assert any(len(reference.fans(d.simplices[on], v)) > 1 for v in range(60)), t
+    whole = np.ones(len(on), bool)
+    assert mesh._one_fan(d.simplices, d.neighbors, whole, 60).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_best_of_cells_equals_a_dictionary(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 400))
+    ab = np.floor(rng.random((n, 2)) * 2**25)
+    at = np.sort(rng.permutation(n)[: rng.integers(1, n + 1)])
+    step, quiet = rng.integers(0, 4, len(at)).astype(np.int32), rng.random(len(at)).astype(np.float32)
+    sides = 2.0 ** rng.uniform(18, 24) / np.sqrt(2.0) ** np.arange(4)
+    best = {}
+    for i, p in enumerate(at):
+        place = ab[p] / sides[step[i]]
+        off = 2 * np.abs(place - np.floor(place) - 0.5).max()
+        key = (step[i], *np.floor(place))
+        best[key] = min(best.get(key, (np.inf, 0)), (np.float32(quiet[i] + np.float32(2) * off * off), p))
+    size = 1 << max(4, int(2 * len(at)).bit_length())
+    table, chosen = np.full(size, -1, np.int32), np.zeros(n, bool)
+    keys = np.empty(size, np.int64)
+    count = mesh_kernels.best_of_cells(ab, at, step, sides, quiet, np.float32(2), keys, table, chosen)
+    assert count == len(best)
+    assert (table == -1).all()
+    assert set(np.flatnonzero(chosen)) == {p for _, p in best.values()}
+
+
+def test_loops_over_triangles_equal_numpy():
+    rng = np.random.default_rng(6)
+    ab = rng.random((50, 2)) * 100
+    xyz = np.column_stack([ab, rng.random(50)]).astype(np.float32)
+    faces = Delaunay(ab).simplices
+    c = ab[faces]
+    u, v = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
+    area = np.empty(len(faces))
+    mesh_kernels.plane_areas(faces, ab, area)
+    np.testing.assert_allclose(area, np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2)
+    mixed = np.where(rng.random(len(faces))[:, None] < 0.5, faces, faces[:, [0, 2, 1]])
+    mixed[3, 2] = mixed[3, 1]
+    turned, there = np.empty_like(mixed), np.empty(len(faces), bool)
+    eye = np.array([50.0, 50.0, 500.0])
+    mesh_kernels.towards(mixed, xyz, eye, turned, there)
+    corner = xyz[turned].astype(float)
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    np.testing.assert_array_equal(there, np.arange(len(faces)) != 3)
+    assert (((eye - corner[:, 0]) * normal).sum(1)[there] > 0).all()
+    np.testing.assert_array_equal(np.sort(turned, axis=1), np.sort(mixed, axis=1))
+    owner, seen = rng.integers(0, 3, 50).astype(np.uint8), rng.integers(0, 8, 50).astype(np.uint8)
+    out = np.empty(len(faces), np.uint8)
+    mesh_kernels.textured_by(faces, owner, seen, 3, out)
+    score = np.stack([(owner[faces] == v).sum(1) + 10 * ((seen[faces] >> v) & 1).all(1) for v in range(3)], 1)
+    np.testing.assert_array_equal(out, score.argmax(1))
+    n = rng.standard_normal((50, 3)).astype(np.float32)
+    start, around = mesh_kernels.incident(faces, 50)
+    off = np.empty(50, np.float32)
+    mesh_kernels.residuals(faces, start, around, xyz, n, off)
+    for v in range(50):
+        mean = xyz[faces[(faces == v).any(1)].ravel()].astype(float).mean(axis=0)
+        assert abs(off[v] - (xyz[v] - mean) @ n[v]) < 1e-3
+    reach = np.empty(50, np.float32)
+    mesh_kernels.sampling(xyz, n, eye, 1e-3, reach)
+    ray = eye - xyz
+    distance = np.linalg.norm(ray, axis=1)
+    np.testing.assert_allclose(reach, 1e-3 * distance / np.maximum((ray * n).sum(1) / distance, 0.2), rtol=1e-5)
 
 
 def test_points_above_each_other_on_a_wall_are_doubles():

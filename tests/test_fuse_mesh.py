@@ -7,6 +7,7 @@ from scipy.spatial import Delaunay
 
 from fringescope import fuse, geometry
 from fringescope.errors import EmptyResultError
+from fringescope.fuse import delaunay
 from fringescope.fuse import levels as levels_of_detail
 from fringescope.settings import MeshSettings
 from fringescope.types import Grid
@@ -92,9 +93,10 @@ def test_bent_places_get_more_vertices():
     x, y = x + jitter[0], y + jitter[1]
     ab = np.stack([x.ravel(), y.ravel()], 1)
     z = np.exp(-((ab[:, 0] / 0.8) ** 2))
-    d = Delaunay(ab)
+    at = delaunay.snapped(ab)
+    d = Delaunay(at)
     normal = np.tile(np.float32([0, 0, 1]), (len(ab), 1))
-    sheet = levels_of_detail.Sheet(ab, np.column_stack([ab, z]).astype(np.float32), normal, d.simplices, d.neighbors,
+    sheet = levels_of_detail.Sheet(at, np.column_stack([ab, z]).astype(np.float32), normal, d.simplices, d.neighbors,
                                    np.ones(len(d.simplices), bool))
     (faces,) = levels_of_detail.simplify(sheet, [len(d.simplices) // 5])
     assert len(faces) in (len(d.simplices) // 5, len(d.simplices) // 5 - 1)
@@ -117,6 +119,54 @@ def test_a_ragged_surface_still_gets_few_triangles():
     for level, most in zip(levels, (1500, 300), strict=True):
         assert 0 < level.n_faces <= most
         assert all(v.tobytes() in points for v in level.vertices)
+
+
+def test_a_preview_alone_is_a_surface_too(on_ball):
+    r, _, fused, c, levels = on_ball
+    points = {p.tobytes() for p in c.xyz}
+    few = fuse.preview(fused, r, MeshSettings(preview_triangles=4_000))
+    assert 3_000 < few.n_faces <= 4_000
+    assert all(v.tobytes() in points for v in few.vertices)
+    assert len(few.vertices) < len(levels[1].vertices) + 100
+    f = faces_of(few)
+    directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    corner = few.vertices[f].astype(float)
+    assert np.percentile(np.abs(scenes.ball().error(corner.mean(1))), 95) < 0.06
+    all_of_it = fuse.surface(fused, r, MeshSettings(triangles=10**6, preview_triangles=10**6))[0]
+    assert fuse.preview(fused, r, MeshSettings(preview_triangles=10**6)).n_faces == all_of_it.n_faces
+
+
+def test_levels_share_their_pictures(on_ball):
+    *_, levels = on_ball
+    textures = {p.view: p.texture for p in levels[0].parts}
+    assert all(p.texture is textures[p.view] for p in levels[1].parts)
+    assert all(p.texture.flags.c_contiguous for level in levels for p in level.parts)
+
+
+def test_a_lattice_of_rows_and_columns_keeps_its_borders():
+    """Four points on one circle at every place, a hole in the middle: the border has the same edges at every level."""
+    x, y = np.meshgrid(np.arange(60.0), np.arange(50.0))
+    ab = np.stack([x.ravel(), y.ravel()], 1)
+    ab = ab[np.hypot(ab[:, 0] - 30, ab[:, 1] - 25) > 6.2]
+    at = delaunay.snapped(ab)
+    simplices, neighbours = delaunay.Triangulation(at, delaunay.along_curve(at)).triangles()
+    on = np.ptp(ab[simplices], axis=1).max(1) < 1.5
+    normal = np.tile(np.float32([0, 0, 1]), (len(ab), 1))
+    z = 0.02 * np.random.default_rng(0).standard_normal(len(ab))
+    sheet = levels_of_detail.Sheet(at, np.column_stack([ab, z]).astype(np.float32), normal, simplices, neighbours, on)
+
+    def border(faces):
+        e = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        e, count = np.unique(e, axis=0, return_counts=True)
+        assert count.max() == 2
+        return set(map(tuple, e[count == 1].tolist()))
+
+    assert set(np.flatnonzero(sheet.border)) == {v for e in border(sheet.faces) for v in e}
+    wanted = [len(sheet.faces) // n for n in (2, 4, 7)]
+    for faces, most in zip(levels_of_detail.simplify(sheet, wanted), wanted, strict=True):
+        assert len(faces) in (most, most - 1)
+        assert border(faces) == border(sheet.faces)
 
 
 def test_nothing_bridges_ball_and_floor(on_ball):
