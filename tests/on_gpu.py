@@ -77,8 +77,8 @@ def compiled():
 
 def compare(view, rig, apart=0.002, s=S):
     """What both ways make of a view; the GPU's decoded view."""
-    want, xyz, sigma_mm = fast.decode(view, rig, s)
-    got, xyz_, sigma_mm_ = fast.decode(view, rig, s, "gpu")
+    want, xyz, sigma_mm, _ = fast.decode(view, rig, s)
+    got, xyz_, sigma_mm_, _ = fast.decode(view, rig, s, "gpu")
     weak = ((want.reasons | got.reasons) & DARK) != 0
     assert ((got.reasons != want.reasons) & ~weak).mean() <= apart
     assert ((got.reasons ^ want.reasons) & DARK != 0).mean() <= apart
