@@ -14,6 +14,8 @@ from fringescope.errors import EmptyResultError
 from fringescope.fuse.levels import Sheet, removable, simplify, triangulations
 from fringescope.fuse.points import Fused
 from fringescope.kernels import mesh as k
+from fringescope.kernels.fusing import OWNED
+from fringescope.kernels.surface import number
 from fringescope.settings import MeshSettings
 from fringescope.types import F32, U8, AnyArray, Bool, Rig, Surface, SurfacePart
 
@@ -36,21 +38,23 @@ class _Points:
 
 def _points(fused: Fused, rig: Rig, s: MeshSettings) -> _Points:
     """Owned points, strided where there are more than `max_points`."""
-    total = sum(int(o.sum()) for o in fused.owned)
-    stride = max(1, math.ceil(math.sqrt(total / s.max_points)))
+    stride = max(1, math.ceil(math.sqrt(len(fused.cloud) / s.max_points)))
     parts: list[tuple[AnyArray, ...]] = []
-    for i, grid in enumerate(fused.grids):
-        rows, cols = np.nonzero(fused.owned[i][::stride, ::stride])
-        rows, cols = rows * stride, cols * stride
-        xyz, normal = grid.xyz[rows, cols], fused.normals[i][rows, cols]
+    first = 0
+    for i, (grid, marks) in enumerate(zip(fused.grids, fused.marks, strict=True)):
+        at = np.empty((-(-marks.shape[0] // stride), -(-marks.shape[1] // stride)), np.int64)
+        first = number(marks, OWNED, stride, first, at)
+        rows, cols = np.nonzero(at >= 0)
+        at, rows, cols = at[rows, cols], rows * stride, cols * stride
+        xyz, normal = fused.cloud.xyz[at], fused.cloud.normals[at]
         camera = rig.cameras[grid.view]
         ray = geometry.centre(camera.pose).astype(np.float32) - xyz
         distance = np.linalg.norm(ray, axis=1)
         cosine = np.einsum("ij,ij->i", ray, normal) / np.maximum(distance, 1e-9)
         pixel_mm = distance / math.sqrt(camera.lens.K[0, 0] * camera.lens.K[1, 1])
         reach = stride * pixel_mm / np.maximum(cosine, 0.2)
-        parts.append((xyz, normal, grid.sigma[rows, cols], reach.astype(np.float32), np.full(len(rows), i, np.uint8),
-                      fused.seen[i][rows, cols], np.stack([cols, rows], axis=1).astype(np.float32)))
+        parts.append((xyz, normal, fused.cloud.sigma[at], reach.astype(np.float32), np.full(len(rows), i, np.uint8),
+                      fused.seen[at], np.stack([cols, rows], axis=1).astype(np.float32)))
     xyz, normal, sigma, reach, owner, seen, pixel = (np.concatenate(column) for column in zip(*parts, strict=True))
     return _Points(xyz, normal, sigma, reach, owner, seen, pixel, stride)
 

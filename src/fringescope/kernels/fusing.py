@@ -1,0 +1,417 @@
+"""What other views say about a pixel's ray, and its colour: one pass over the pixels that matter, in blocks.
+
+Of every row the pixels wanted are listed, so that no work goes to others. Arrays and scalars only, in float32, in loops
+that compilers turn into vector instructions; only what lies scattered in other views is fetched pixel by pixel.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from fringescope.kernels.colour import tone
+from fringescope.kernels.surface import CODE, locate
+from fringescope.kernels.views import nearest, pick, project
+from fringescope.threads import by_rows
+
+BLOCK = 256  #: pixels that are worked on together
+OWNED, EDGE, BLENDED = 1, 2, 4  #: bits of a view's marks
+TILE = 32  #: side, in pixels, of the squares of a picture that are blended or not
+
+_f = np.float32
+_ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0, 3.0))
+_CONTRACT = {"contract"}
+
+
+class Side(NamedTuple):
+    """One view with all that the sums need: its weights follow from normal, sigma, and rise."""
+
+    xyz: np.ndarray  #: (H * W * 3,) float32, world mm
+    sigma: np.ndarray  #: (H * W,) float32
+    code: np.ndarray  #: (H * W * 2,) int16, normals (see `surface.encode`)
+    rise: np.ndarray  #: (h, w) float32, 0..1 from borders and jumps, per square of `step` pixels, one more all round
+    step: int
+    rgb: np.ndarray  #: (H * W * 3,) float32, linear light
+    gain: np.ndarray  #: (3,) float32
+    clear: np.ndarray  #: (H * W,) uint8, 255 far from saturated pixels; or (1,)
+    share: np.float32  #: of a view's colours; little where it has none
+    centre: np.ndarray  #: (3,) float32, world mm
+    height: int
+    width: int
+    pose: np.ndarray  #: (12,) float64
+    lens: np.ndarray  #: (10,) float64
+
+
+class Limits(NamedTuple):
+    """Thresholds, float32."""
+
+    agree_sigma: np.float32
+    agree_mm: np.float32
+    grazing: np.float32  #: cosine at which weights have fallen to nothing
+    per_front: np.float32  #: one over the cosines between nothing and all
+    gloss: np.float32
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def listed(mask, bit, near, i, first, out):
+    """Columns of row i from `first` on, at most BLOCK, that have the `bit`; with bit 0 those near but not owned.
+
+    Returns how many, and the column to go on from.
+    """
+    n, j, W = 0, first, mask.shape[1]
+    row = mask[i]
+    if bit != 0:
+        while j < W and n < BLOCK:
+            out[n] = j
+            n += (row[j] & bit) != 0
+            j += 1
+        return n, j
+    squares = near[i // TILE]
+    while j < W and n < BLOCK:
+        if squares[j // TILE] == 0:
+            j = (j // TILE + 1) * TILE
+            continue
+        out[n] = j
+        n += (row[j] & OWNED) == 0
+        j += 1
+    return n, min(j, W)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _between(rise, step, i, j):
+    """`rise` at pixel (i, j), bilinear between the middles of its squares."""
+    y, x = (_f(i) + _HALF) / _f(step) + _HALF, (_f(j) + _HALF) / _f(step) + _HALF
+    a, b = int(y), int(x)
+    fy, fx = y - _f(a), x - _f(b)
+    top = rise[a, b] + fx * (rise[a, b + 1] - rise[a, b])
+    low = rise[a + 1, b] + fx * (rise[a + 1, b + 1] - rise[a + 1, b])
+    return top + fy * (low - top)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fetch(side, row, column, n, S, P, Q, rise, clear):
+    """Sigma, code of the normal, rise and clearness at pixels (row, column); row -1 leaves sigma NaN."""
+    W = side.width
+    bright = side.clear.shape[0] > 1
+    for k in range(n):
+        if row[k] >= 0:
+            p = row[k] * W + column[k]
+            S[k] = side.sigma[p]
+            P[k], Q[k] = _f(side.code[2 * p]), _f(side.code[2 * p + 1])
+            rise[k] = _between(side.rise, side.step, row[k], column[k])
+            clear[k] = _f(side.clear[p]) / _f(255) if bright else _ONE
+        else:
+            S[k] = np.nan
+            P[k], Q[k], rise[k], clear[k] = _ZERO, _ZERO, _ZERO, _ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def decode(P, Q, n, X, Y, Z):
+    """Codes of normals to unit vectors."""
+    for k in range(n):
+        u, v = P[k] * _f(1 / CODE), Q[k] * _f(1 / CODE)
+        z = _ONE - abs(u) - abs(v)
+        t = max(-z, _ZERO)
+        u += -t if u >= _ZERO else t
+        v += -t if v >= _ZERO else t
+        size = _ONE / math.sqrt(u * u + v * v + z * z)
+        X[k], Y[k], Z[k] = u * size, v * size, z * size
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def weigh(X, Y, Z, S, NX, NY, NZ, rise, centre, limits, n, cosine, sigma_n, weight, tint):
+    """Cosine of incidence, sigma along the normal, weight of the point and weight of its colour.
+
+    The weight is the cosine over the variance along the normal, times the rise from borders, times a smooth fall to
+    nothing at grazing incidence. NaN where there is no point.
+    """
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    for k in range(n):
+        dx, dy, dz = cx - X[k], cy - Y[k], cz - Z[k]
+        c = max((dx * NX[k] + dy * NY[k] + dz * NZ[k]) / math.sqrt(dx * dx + dy * dy + dz * dz), _ZERO)
+        front = min(max((c - limits.grazing) * limits.per_front, _ZERO), _ONE)
+        r = max(rise[k], _f(1e-3)) * front * front * (_THREE - _TWO * front)
+        s = S[k] * max(c, _f(0.05))
+        least = max(s, _f(1e-6))
+        cosine[k] = c
+        sigma_n[k] = s
+        weight[k] = r * c / (least * least) + (s - s)
+        tint[k] = r * c * c + (s - s)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _rays(X, Y, Z, centre, n, DX, DY, DZ):
+    for k in range(n):
+        x, y, z = X[k] - centre[0], Y[k] - centre[1], Z[k] - centre[2]
+        inverse = _ONE / math.sqrt(x * x + y * y + z * z)
+        DX[k], DY[k], DZ[k] = x * inverse, y * inverse, z * inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _compare(own, ray, depth, other, cosine, sigma_w, weight, inverse_focal, limits, n, shift, ok):
+    """Whether the other view's samples lie on the same surface, and how far along the own ray; NaN if that is unsure.
+
+    Along the mean m of both normals, which is perpendicular to the chord PQ of any surface of second order, the views
+    differ by s = (Q - P) . m. They agree if abs(s) <= agree_sigma * sqrt(sp^2 + sq^2) + agree_mm and Q is no farther
+    from P than a pixel of w is wide on the surface: on a sphere the chord to any Q has s = 0.
+    """
+    X, Y, Z, NX, NY, NZ, sigma = own
+    DX, DY, DZ = ray
+    QX, QY, QZ, MX, MY, MZ = other
+    for k in range(n):
+        mx, my, mz = NX[k] + MX[k], NY[k] + MY[k], NZ[k] + MZ[k]
+        size = mx * mx + my * my + mz * mz
+        inverse = _ONE / math.sqrt(size)
+        cx, cy, cz = QX[k] - X[k], QY[k] - Y[k], QZ[k] - Z[k]
+        s = (cx * mx + cy * my + cz * mz) * inverse
+        limit = limits.agree_sigma * math.sqrt(sigma[k] * sigma[k] + sigma_w[k] * sigma_w[k]) + limits.agree_mm
+        reach = depth[k] * inverse_focal / max(cosine[k], _f(0.05)) + limit
+        slope = (mx * DX[k] + my * DY[k] + mz * DZ[k]) * inverse
+        ok[k] = (weight[k] > _ZERO) & (size >= _ONE) & (abs(s) <= limit) & (cx * cx + cy * cy + cz * cz <= reach * reach)
+        shift[k] = s / slope if slope < _f(-0.05) else _f(np.nan)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _add(ok, along, weight, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ):
+    for k in range(n):
+        use = ok[k] & (along[k] == along[k])
+        w = weight[k] if use else _ZERO
+        ws = w * sigma_w[k] if use else _ZERO
+        shift[k] += w * along[k] if use else _ZERO
+        total[k] += w
+        variance[k] += ws * ws
+        FX[k] += w * MX[k]
+        FY[k] += w * MY[k]
+        FZ[k] += w * MZ[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _colours(side, U, V, ok, tint, clear, bit, n, C, seen):
+    """Colour of the other view at (U, V), bilinear, and its weight, into C (4, BLOCK); what it sees is marked."""
+    W, H, rgb = side.width, side.height, side.rgb
+    right, below = 3 if W > 1 else 0, 3 * W if H > 1 else 0
+    for k in range(n):
+        C[3, k] = _ZERO
+        if not ok[k]:
+            continue
+        seen[k] |= bit
+        w = tint[k] * clear[k] * side.share
+        if not w > _ZERO:
+            continue
+        j, i = max(min(int(U[k]), W - 2), 0), max(min(int(V[k]), H - 2), 0)
+        fu, fv = U[k] - _f(j), V[k] - _f(i)
+        p = 3 * (i * W + j)
+        q = p + below
+        for c in range(3):
+            top = rgb[p + c] + fu * (rgb[p + right + c] - rgb[p + c])
+            low = rgb[q + c] + fu * (rgb[q + right + c] - rgb[q + c])
+            C[c, k] = (top + fv * (low - top)) * side.gain[c]
+        C[3, k] = w
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _light(c0, c1, c2, w, n, soft, total):
+    """What a view adds to the soft minimum of the views' light."""
+    for k in range(n):
+        light = max((c0[k] + c1[k] + c2[k]) * _f(1 / 3) + _f(1e-3), _f(1e-3))
+        square = light * light
+        soft[k] += w[k] / (square * square) if w[k] > _ZERO else _ZERO
+        total[k] += w[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _mix(c0, c1, c2, w, low, gloss, n, s0, s1, s2, sw):
+    """Add a view's colour: less of it where it is brighter than the others by more than the share `gloss`."""
+    for k in range(n):
+        excess = max((c0[k] + c1[k] + c2[k]) * _f(1 / 3) + _f(1e-3) - low[k], _ZERO) / (gloss * low[k])
+        use = w[k] / (_ONE + excess * excess) if w[k] > _ZERO else _ZERO
+        s0[k] += use * c0[k] if w[k] > _ZERO else _ZERO
+        s1[k] += use * c1[k] if w[k] > _ZERO else _ZERO
+        s2[k] += use * c2[k] if w[k] > _ZERO else _ZERO
+        sw[k] += use
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def blend(C, views, gloss, n, soft, total, out):
+    """Blended colours out (4, BLOCK) from C (views, 4, BLOCK): colours and weights; the first is the view's own.
+
+    A view that is brighter than a soft minimum over the views by more than the share `gloss` sees a highlight there
+    and counts less. Where no view has a weight the own colour stays.
+    """
+    for k in range(n):
+        soft[k] = total[k] = _ZERO
+        out[0, k] = out[1, k] = out[2, k] = out[3, k] = _ZERO
+    for v in range(views):
+        _light(C[v, 0], C[v, 1], C[v, 2], C[v, 3], n, soft, total)
+    for k in range(n):
+        soft[k] = math.sqrt(math.sqrt(total[k] / soft[k])) if total[k] > _ZERO else _ONE
+    for v in range(views):
+        _mix(C[v, 0], C[v, 1], C[v, 2], C[v, 3], soft, gloss, n, out[0], out[1], out[2], out[3])
+    for k in range(n):
+        none = not out[3, k] > _ZERO
+        share = _ONE if none else _ONE / out[3, k]
+        for c in range(3):
+            out[c, k] = C[0, c, k] if none else out[c, k] * share
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _settle(own, ray, weight, sums, n, out):
+    """The weighted mean along each ray, the mean normal and sigma along the ray: out (7, BLOCK)."""
+    X, Y, Z, NX, NY, NZ, sigma = own
+    DX, DY, DZ = ray
+    shift, total, variance, FX, FY, FZ = sums
+    for k in range(n):
+        w = max(weight[k], _f(1e-9))
+        share = _ONE / (w + total[k])
+        along = shift[k] * share
+        nx, ny, nz = FX[k] + w * NX[k], FY[k] + w * NY[k], FZ[k] + w * NZ[k]
+        size = _ONE / math.sqrt(nx * nx + ny * ny + nz * nz)
+        ws = w * sigma[k]
+        slope = -(NX[k] * DX[k] + NY[k] * DY[k] + NZ[k] * DZ[k])
+        out[0, k], out[1, k], out[2, k] = X[k] + along * DX[k], Y[k] + along * DY[k], Z[k] + along * DZ[k]
+        out[3, k], out[4, k], out[5, k] = nx * size, ny * size, nz * size
+        out[6, k] = math.sqrt(variance[k] + ws * ws) * share / max(slope, _f(0.05))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _own(side, i, columns, n, row, X, Y, Z):
+    """The own points of the listed columns of row i."""
+    part = side.xyz[3 * i * side.width : 3 * (i + 1) * side.width]
+    for k in range(n):
+        p = 3 * columns[k]
+        X[k], Y[k], Z[k] = part[p], part[p + 1], part[p + 2]
+        row[k] = i
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _own_colours(side, i, columns, n, tint, clear, C):
+    part = side.rgb[3 * i * side.width : 3 * (i + 1) * side.width]
+    for k in range(n):
+        p = 3 * columns[k]
+        for c in range(3):
+            C[c, k] = part[p + c] * side.gain[c]
+        w = tint[k] * clear[k] * side.share
+        C[3, k] = w if w > _ZERO else _ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plain(side, i, table, picture):
+    """A row of the view's own picture, balanced."""
+    part = side.rgb[3 * i * side.width : 3 * (i + 1) * side.width]
+    g0, g1, g2 = side.gain[0], side.gain[1], side.gain[2]
+    for j in range(side.width):
+        picture[i, j, 0] = tone(part[3 * j] * g0, table)
+        picture[i, j, 1] = tone(part[3 * j + 1] * g1, table)
+        picture[i, j, 2] = tone(part[3 * j + 2] * g2, table)
+
+
+@by_rows(lambda _sides, _count, _view, _limits, marks, *_: marks.shape[0])
+def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table, xyz, normal, sigma, rgb, seen,
+         picture):  # fmt: skip
+    """Fuse the pixels of view number `view` that have `bit` in `marks` (H, W): the mean along each pixel's ray.
+
+    The first `count` of `sides` are views. Each other view contributes the sample of the pixel nearest to the point,
+    with its weight, if it lies on the same surface. Row i's points go to start[i] and on of `xyz`, `normal` (n, 3),
+    `sigma`, `seen` (n,), and their blended colours to `rgb` (n, 3) and to `picture` (H, W, 3), if that has rows; then
+    pixels in squares of TILE that are `near` get blended colours as well, others their own. A point that nothing else
+    sees stays as it is. What other views see gets BLENDED in `marks`.
+    """
+    own = sides[view]
+    f = np.float32
+    X, Y, Z, S = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    NX, NY, NZ, SN = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    DX, DY, DZ, weight = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    U, V, D, P, Q = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    QX, QY, QZ, MX, MY, MZ = (
+        np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f),
+        np.empty(BLOCK, f),
+    )  # fmt: skip
+    shift, total, variance, FX, FY, FZ = (
+        np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f),
+        np.empty(BLOCK, f),
+    )  # fmt: skip
+    rise, clear, cosine, tint = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    sigma_w, weight_w, along = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    C, out, settled = np.empty((count, 4, BLOCK), f), np.empty((4, BLOCK), f), np.empty((7, BLOCK), f)
+    row, column, columns = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32), np.empty(BLOCK + 1, np.int32)
+    ok, said = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.uint8)
+    pictured = picture.shape[0] > 0
+    for i in range(first, last):
+        at = start[i]
+        if pictured:
+            _plain(own, i, table, picture)
+        for turn in range(2 if pictured else 1):
+            j = 0
+            while j < own.width:
+                n, j = listed(marks, bit if turn == 0 else 0, near, i, j, columns)
+                if n == 0:
+                    continue
+                _own(own, i, columns, n, row, X, Y, Z)
+                _fetch(own, row, columns, n, S, P, Q, rise, clear)
+                decode(P, Q, n, NX, NY, NZ)
+                weigh(X, Y, Z, S, NX, NY, NZ, rise, own.centre, limits, n, cosine, SN, weight, tint)
+                _rays(X, Y, Z, own.centre, n, DX, DY, DZ)
+                if pictured:
+                    _own_colours(own, i, columns, n, tint, clear, C[0])
+                for k in range(n):
+                    shift[k] = total[k] = variance[k] = FX[k] = FY[k] = FZ[k] = _ZERO
+                    said[k] = 0
+                slot = 1
+                for w in range(count):
+                    if w == view:
+                        continue
+                    other = sides[w]
+                    project(X, Y, Z, other.pose, other.lens, n, U, V, D)
+                    nearest(U, V, D, other.height, other.width, _ZERO, n, row, column)
+                    pick(row, column, other.width, other.xyz, n, QX, QY, QZ)
+                    _fetch(other, row, column, n, S, P, Q, rise, clear)
+                    decode(P, Q, n, MX, MY, MZ)
+                    weigh(QX, QY, QZ, S, MX, MY, MZ, rise, other.centre, limits, n, cosine, sigma_w, weight_w, tint)
+                    focal = _f(1.0 / math.sqrt(other.lens[0] * other.lens[1]))
+                    _compare((X, Y, Z, NX, NY, NZ, SN), (DX, DY, DZ), D, (QX, QY, QZ, MX, MY, MZ), cosine, sigma_w,
+                             weight_w, focal, limits, n, along, ok)
+                    _add(ok, along, weight_w, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ)
+                    if pictured:
+                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, C[slot], said)
+                    slot += 1
+                if pictured:
+                    blend(C, count, limits.gloss, n, cosine, tint, out)
+                    for k in range(n):
+                        r, g, b = tone(out[0, k], table), tone(out[1, k], table), tone(out[2, k], table)
+                        c = columns[k]
+                        picture[i, c, 0], picture[i, c, 1], picture[i, c, 2] = r, g, b
+                        marks[i, c] |= BLENDED if said[k] != 0 else 0
+                        if turn == 0:
+                            rgb[at + k, 0], rgb[at + k, 1], rgb[at + k, 2] = r, g, b
+                            seen[at + k] = said[k] | np.uint8(1 << view)
+                if turn == 0:
+                    _settle((X, Y, Z, NX, NY, NZ, SN), (DX, DY, DZ), weight, (shift, total, variance, FX, FY, FZ), n,
+                            settled)
+                    for k in range(n):
+                        for c in range(3):
+                            xyz[at + k, c] = settled[c, k]
+                            normal[at + k, c] = settled[3 + c, k]
+                        sigma[at + k] = settled[6, k]
+                    at += n
+
+
+@by_rows(lambda _side, _limits, _step, _raster, _rows, _cols, weight, *_: weight.shape[0])
+def thinned(first, last, side, limits, step, raster, rows, cols, weight, row_out, column_out):
+    """Weights (h, w) of every `step`-th point, and the cells (row, column) of the raster that they lie in, row -1: none.
+    """
+    f = np.float32
+    X, Y, Z, S = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    NX, NY, NZ, P, Q = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    rise, clear, cosine, sigma_n = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    tint, row, columns = np.empty(BLOCK, f), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    for i in range(first, last):
+        for col in range(0, weight.shape[1], BLOCK):
+            n = min(BLOCK, weight.shape[1] - col)
+            for k in range(n):
+                columns[k] = (col + k) * step
+            _own(side, i * step, columns, n, row, X, Y, Z)
+            _fetch(side, row, columns, n, S, P, Q, rise, clear)
+            decode(P, Q, n, NX, NY, NZ)
+            weigh(X, Y, Z, S, NX, NY, NZ, rise, side.centre, limits, n, cosine, sigma_n, weight[i, col : col + n], tint)
+            locate(X, Y, Z, raster, rows, cols, n, row_out[i, col : col + n], column_out[i, col : col + n])
