@@ -25,7 +25,6 @@ from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, Cloud, Grid,
 
 _SAMPLES = 60_000  # pixels of a view that tell its sampling
 _NEAR = 11  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
-_MOST = 8  # views; kernels are compiled for as many, whoever comes
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +138,15 @@ def _side(grid: Grid, photo: Photo, gain: F64, share: float, spacing: float, ras
     k.survey(*_points(grid), centre, _angle(camera), s.normal_radius, s.max_slope, s.jump_sigma, squares, step,
              raster.vector, code, there)
     whole = _close((squares & k.SOME) != 0, hole / step) & ((squares & k.TORN) == 0)
-    rise = np.pad(_rise(whole, width / step), 1, mode="edge")
+    rise = np.empty((H, W), np.uint8)
+    colours.spread(rise, np.pad(_rise(whole, width / step), 1, mode="edge"), step)
     clear = np.zeros(1, np.uint8)
     if photo.saturated.any():
         clear = np.empty((H, W), np.uint8)
         colours.clearness(constant(photo.saturated), s.highlight_pixels, clear)
     return fusing.Side(
-        constant(grid.xyz).reshape(-1), constant(grid.sigma).reshape(-1), constant(code).reshape(-1), constant(rise),
-        step, constant(photo.rgb).reshape(-1), gain.astype(np.float32), constant(clear).reshape(-1), np.float32(share),
+        constant(grid.xyz).reshape(-1), constant(grid.sigma).reshape(-1), constant(code).reshape(-1),
+        constant(rise).reshape(-1), constant(photo.rgb).reshape(-1), gain.astype(np.float32), constant(clear).reshape(-1), np.float32(share),
         centre.astype(np.float32), H, W, geometry.pose_vector(camera.pose), geometry.lens_vector(camera.lens),
     )
 
@@ -191,7 +191,7 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
              for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
     owner, edge = settle_owners(sides, limits, raster, there)
     del there
-    filled = tuple((sides + _MOST * sides[:1])[:_MOST])
+    filled = tuple(sides)
     marks = [np.empty(g.sigma.shape, np.uint8) for g in grids]
     near = [np.zeros((-(-len(m) // fusing.TILE), -(-m.shape[1] // fusing.TILE)), np.uint8) for m in marks]
     owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))

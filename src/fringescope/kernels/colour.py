@@ -22,6 +22,70 @@ def tone(light, table):
     return table[int(min(max(light if light == light else _ZERO, _ZERO), _ONE) * _f(4096) + _HALF)]
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _numbers(light, gain, n, out):
+    """Places in a table of 4097 of light times `gain`, clipped to 0..1; NaN is black."""
+    for k in range(n):
+        x = light[k] * gain[k]
+        x = x if x > _ZERO else _ZERO
+        out[k] = np.int32(min(x, _ONE) * _f(4096) + _HALF)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _places(light, n, out):
+    for k in range(n):
+        x = light[k] if light[k] > _ZERO else _ZERO
+        out[k] = np.int32(min(x, _ONE) * _f(4096) + _HALF)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def codes_of(light, table, n, out):
+    """Codes (n,) int32 of light."""
+    _places(light, n, out)
+    for k in range(n):
+        out[k] = table[np.uintp(out[k])]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def encode_row(light, gain, table, scratch, out):
+    """A row of a picture (3 W,) times `gain` (3,) to the codes of `table` (4097,); `scratch` (n,) int32."""
+    m = len(scratch) // 3 * 3
+    factors = np.empty(m, np.float32)
+    for k in range(m):
+        factors[k] = gain[k % 3]
+    for first in range(0, len(light), m):
+        n = min(m, len(light) - first)
+        _numbers(light[first : first + n], factors, n, scratch)
+        part = out[first : first + n]
+        for k in range(n):
+            part[k] = table[np.uintp(scratch[k])]
+
+
+@by_rows(lambda out, *_: out.shape[0])
+def spread(first, last, out, coarse, step):
+    """`coarse` (h, w), 0..1, one value per square of `step` pixels and one more all round, to 0..255 (H, W), bilinear.
+    """
+    W = out.shape[1]
+    line = np.empty(coarse.shape[1], np.float32)
+    per, half = _ONE / _f(step), _HALF / _f(step) + _HALF
+    for i in range(first, last):
+        y = _f(i) * per + half
+        a = int(y)
+        fy = y - _f(a)
+        for q in range(len(line)):
+            line[q] = (coarse[a, q] + fy * (coarse[a + 1, q] - coarse[a, q])) * _f(255) + _HALF
+        row = out[i]
+        if step == 1:
+            for j in range(W):
+                row[j] = np.uint8(line[j + 1])
+            continue
+        for q in range(len(line) - 1):  # from the middle of square q - 1 to that of square q
+            begin = math.ceil((q - _HALF) * step - _HALF)
+            low, slope = line[q], line[q + 1] - line[q]
+            for j in range(max(begin, 0), min(begin + step, W)):
+                row[j] = np.uint8(low + slope * (_f(j) * per + half - _f(q)))
+
+
 @by_rows(lambda light, *_: light.shape[0])
 def encode(first, last, light, gain, table, out):
     """A picture times `gain` (3,) to the codes of `table` (4097,)."""
@@ -110,23 +174,31 @@ def fill_gaps(first, last, marks, bit, near, tile, own, gain, codes, light, pict
     (256,) these into light.
     """
     H, W = marks.shape
-    room = (2 * GAP + 1) * (2 * GAP + 1)
+    least = int(0.3 * (2 * GAP + 1) * (2 * GAP + 1))
+    sums = np.empty(tile + 2 * GAP, np.uint8)
     for i in range(first, last):
+        top, end = max(i - GAP, 0), min(i + GAP + 1, H)
         for q in range(near.shape[1]):
             if near[i // tile, q] == 0:
                 continue
-            for j in range(q * tile, min((q + 1) * tile, W)):
+            left, right = q * tile, min((q + 1) * tile, W)
+            sums[:] = 0
+            for ii in range(top, end):
+                a, b = max(left - GAP, 0), min(right + GAP, W)
+                part, target = marks[ii, a:b], sums[a - left + GAP :]
+                for k in range(b - a):
+                    target[k] += 1 if (part[k] & bit) != 0 else 0
+            for j in range(left, right):
                 if (marks[i, j] & bit) != 0:
                     continue
                 n = 0
-                for ii in range(max(i - GAP, 0), min(i + GAP + 1, H)):
-                    for jj in range(max(j - GAP, 0), min(j + GAP + 1, W)):
-                        n += (marks[ii, jj] & bit) != 0
-                if not n > 0.3 * room:
+                for k in range(2 * GAP + 1):
+                    n += sums[j - left + k]
+                if n <= least:
                     continue
                 for c in range(3):
                     after = before = _ZERO
-                    for ii in range(max(i - GAP, 0), min(i + GAP + 1, H)):
+                    for ii in range(top, end):
                         for jj in range(max(j - GAP, 0), min(j + GAP + 1, W)):
                             if (marks[ii, jj] & bit) != 0:
                                 after += light[picture[ii, jj, c]]

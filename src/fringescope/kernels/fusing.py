@@ -10,17 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from fringescope.kernels.colour import tone
+from fringescope.kernels.colour import codes_of, encode_row
 from fringescope.kernels.surface import CODE, locate
 from fringescope.kernels.views import nearest, pick, project
 from fringescope.threads import by_rows
 
 BLOCK = 256  #: pixels that are worked on together
-OWNED, EDGE, BLENDED = 1, 2, 4  #: bits of a view's marks
+OWNED, EDGE, POINT, BLENDED = 1, 2, 4, 8  #: bits of a view's marks
 TILE = 32  #: side, in pixels, of the squares of a picture that are blended or not
 
 _f = np.float32
 _ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0, 3.0))
+_ADD1, _ADD2 = np.uintp(1), np.uintp(2)  # to indices, which are quicker without a sign
 _CONTRACT = {"contract"}
 
 
@@ -30,8 +31,7 @@ class Side(NamedTuple):
     xyz: np.ndarray  #: (H * W * 3,) float32, world mm
     sigma: np.ndarray  #: (H * W,) float32
     code: np.ndarray  #: (H * W * 2,) int16, normals (see `surface.encode`)
-    rise: np.ndarray  #: (h, w) float32, 0..1 from borders and jumps, per square of `step` pixels, one more all round
-    step: int
+    rise: np.ndarray  #: (H * W,) uint8, 0..255 from borders and jumps
     rgb: np.ndarray  #: (H * W * 3,) float32, linear light
     gain: np.ndarray  #: (3,) float32
     clear: np.ndarray  #: (H * W,) uint8, 255 far from saturated pixels; or (1,)
@@ -54,39 +54,28 @@ class Limits(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def listed(mask, bit, near, i, first, out):
-    """Columns of row i from `first` on, at most BLOCK, that have the `bit`; with bit 0 those near but not owned.
+def listed(marks, bit, near, first, out):
+    """Columns of a row of `marks` from `first` on, at most BLOCK, that have the `bit`; with bit 0: points near, not owned.
 
-    Returns how many, and the column to go on from.
+    Returns how many, and the column to go on from. `near` (w,) tells which squares of TILE pixels to look at then.
     """
-    n, j, W = 0, first, mask.shape[1]
-    row = mask[i]
+    n, j, W = 0, first, marks.shape[0]
     if bit != 0:
         while j < W and n < BLOCK:
             out[n] = j
-            n += (row[j] & bit) != 0
+            n += (marks[j] & bit) != 0
             j += 1
         return n, j
-    squares = near[i // TILE]
     while j < W and n < BLOCK:
-        if squares[j // TILE] == 0:
-            j = (j // TILE + 1) * TILE
+        end = min((j // TILE + 1) * TILE, W)
+        if near[j // TILE] == 0:
+            j = end
             continue
-        out[n] = j
-        n += (row[j] & OWNED) == 0
-        j += 1
-    return n, min(j, W)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _between(rise, step, i, j):
-    """`rise` at pixel (i, j), bilinear between the middles of its squares."""
-    y, x = (_f(i) + _HALF) / _f(step) + _HALF, (_f(j) + _HALF) / _f(step) + _HALF
-    a, b = int(y), int(x)
-    fy, fx = y - _f(a), x - _f(b)
-    top = rise[a, b] + fx * (rise[a, b + 1] - rise[a, b])
-    low = rise[a + 1, b] + fx * (rise[a + 1, b + 1] - rise[a + 1, b])
-    return top + fy * (low - top)
+        while j < end and n < BLOCK:
+            out[n] = j
+            n += (marks[j] & (POINT | OWNED)) == POINT
+            j += 1
+    return n, j
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -96,14 +85,18 @@ def _fetch(side, row, column, n, S, P, Q, rise, clear):
     bright = side.clear.shape[0] > 1
     for k in range(n):
         if row[k] >= 0:
-            p = row[k] * W + column[k]
+            p = np.uintp(row[k] * W + column[k])
             S[k] = side.sigma[p]
-            P[k], Q[k] = _f(side.code[2 * p]), _f(side.code[2 * p + 1])
-            rise[k] = _between(side.rise, side.step, row[k], column[k])
-            clear[k] = _f(side.clear[p]) / _f(255) if bright else _ONE
+            P[k], Q[k] = _f(side.code[p + p]), _f(side.code[p + p + _ADD1])
+            rise[k] = _f(side.rise[p])
         else:
             S[k] = np.nan
-            P[k], Q[k], rise[k], clear[k] = _ZERO, _ZERO, _ZERO, _ZERO
+            P[k] = Q[k] = rise[k] = _ZERO
+        clear[k] = _ONE
+    if bright:
+        for k in range(n):
+            if row[k] >= 0:
+                clear[k] = _f(side.clear[np.uintp(row[k] * W + column[k])]) * _f(1 / 255)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -131,7 +124,7 @@ def weigh(X, Y, Z, S, NX, NY, NZ, rise, centre, limits, n, cosine, sigma_n, weig
         dx, dy, dz = cx - X[k], cy - Y[k], cz - Z[k]
         c = max((dx * NX[k] + dy * NY[k] + dz * NZ[k]) / math.sqrt(dx * dx + dy * dy + dz * dz), _ZERO)
         front = min(max((c - limits.grazing) * limits.per_front, _ZERO), _ONE)
-        r = max(rise[k], _f(1e-3)) * front * front * (_THREE - _TWO * front)
+        r = max(rise[k] * _f(1 / 255), _f(1e-3)) * front * front * (_THREE - _TWO * front)
         s = S[k] * max(c, _f(0.05))
         least = max(s, _f(1e-6))
         cosine[k] = c
@@ -187,27 +180,35 @@ def _add(ok, along, weight, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _colours(side, U, V, ok, tint, clear, bit, n, C, seen):
-    """Colour of the other view at (U, V), bilinear, and its weight, into C (4, BLOCK); what it sees is marked."""
+def _colours(side, U, V, ok, tint, clear, bit, n, c0, c1, c2, w, seen):
+    """Colour of the other view at (U, V), bilinear, and its weight; what it sees is marked with `bit`."""
     W, H, rgb = side.width, side.height, side.rgb
-    right, below = 3 if W > 1 else 0, 3 * W if H > 1 else 0
+    right, below = np.uintp(3 if W > 1 else 0), np.uintp(3 * W if H > 1 else 0)
+    g0, g1, g2 = side.gain[0], side.gain[1], side.gain[2]
     for k in range(n):
-        C[3, k] = _ZERO
+        w[k] = _ZERO
         if not ok[k]:
             continue
         seen[k] |= bit
-        w = tint[k] * clear[k] * side.share
-        if not w > _ZERO:
+        own = tint[k] * clear[k] * side.share
+        if not own > _ZERO:
             continue
-        j, i = max(min(int(U[k]), W - 2), 0), max(min(int(V[k]), H - 2), 0)
+        j, i = max(min(np.int32(U[k]), W - 2), 0), max(min(np.int32(V[k]), H - 2), 0)
         fu, fv = U[k] - _f(j), V[k] - _f(i)
-        p = 3 * (i * W + j)
+        p = np.uintp(3 * (i * W + j))
         q = p + below
-        for c in range(3):
-            top = rgb[p + c] + fu * (rgb[p + right + c] - rgb[p + c])
-            low = rgb[q + c] + fu * (rgb[q + right + c] - rgb[q + c])
-            C[c, k] = (top + fv * (low - top)) * side.gain[c]
-        C[3, k] = w
+        a, b = rgb[p], rgb[q]
+        a, b = a + fu * (rgb[p + right] - a), b + fu * (rgb[q + right] - b)
+        c0[k] = (a + fv * (b - a)) * g0
+        p, q = p + _ADD1, q + _ADD1
+        a, b = rgb[p], rgb[q]
+        a, b = a + fu * (rgb[p + right] - a), b + fu * (rgb[q + right] - b)
+        c1[k] = (a + fv * (b - a)) * g1
+        p, q = p + _ADD1, q + _ADD1
+        a, b = rgb[p], rgb[q]
+        a, b = a + fu * (rgb[p + right] - a), b + fu * (rgb[q + right] - b)
+        c2[k] = (a + fv * (b - a)) * g2
+        w[k] = own
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -232,46 +233,72 @@ def _mix(c0, c1, c2, w, low, gloss, n, s0, s1, s2, sw):
         sw[k] += use
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def blend(C, views, gloss, n, soft, total, out):
-    """Blended colours out (4, BLOCK) from C (views, 4, BLOCK): colours and weights; the first is the view's own.
-
-    A view that is brighter than a soft minimum over the views by more than the share `gloss` sees a highlight there
-    and counts less. Where no view has a weight the own colour stays.
-    """
-    for k in range(n):
-        soft[k] = total[k] = _ZERO
-        out[0, k] = out[1, k] = out[2, k] = out[3, k] = _ZERO
-    for v in range(views):
-        _light(C[v, 0], C[v, 1], C[v, 2], C[v, 3], n, soft, total)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _darkest(total, n, soft):
     for k in range(n):
         soft[k] = math.sqrt(math.sqrt(total[k] / soft[k])) if total[k] > _ZERO else _ONE
-    for v in range(views):
-        _mix(C[v, 0], C[v, 1], C[v, 2], C[v, 3], soft, gloss, n, out[0], out[1], out[2], out[3])
-    for k in range(n):
-        none = not out[3, k] > _ZERO
-        share = _ONE if none else _ONE / out[3, k]
-        for c in range(3):
-            out[c, k] = C[0, c, k] if none else out[c, k] * share
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _settle(own, ray, weight, sums, n, out):
-    """The weighted mean along each ray, the mean normal and sigma along the ray: out (7, BLOCK)."""
-    X, Y, Z, NX, NY, NZ, sigma = own
-    DX, DY, DZ = ray
-    shift, total, variance, FX, FY, FZ = sums
+def _divide(own, weight, n, out):
+    for k in range(n):
+        out[k] = out[k] / weight[k] if weight[k] > _ZERO else own[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def blend(C, views, gloss, n, soft, total, r, g, b, weight):
+    """Blended colours r, g, b from C (views, 4, BLOCK): colours and weights; the first is the view's own.
+
+    A view that is brighter than a soft minimum over the views by more than the share `gloss` sees a highlight there
+    and counts less. Where no view has a weight the own colour stays. `soft`, `total`, `weight` are scratch.
+    """
+    for k in range(n):
+        soft[k] = total[k] = r[k] = g[k] = b[k] = weight[k] = _ZERO
+    for v in range(views):
+        _light(C[v, 0], C[v, 1], C[v, 2], C[v, 3], n, soft, total)
+    _darkest(total, n, soft)
+    for v in range(views):
+        _mix(C[v, 0], C[v, 1], C[v, 2], C[v, 3], soft, gloss, n, r, g, b, weight)
+    _divide(C[0, 0], weight, n, r)
+    _divide(C[0, 1], weight, n, g)
+    _divide(C[0, 2], weight, n, b)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _settle_points(X, Y, Z, DX, DY, DZ, weight, shift, total, n, x, y, z):
+    """The weighted mean along each ray."""
+    for k in range(n):
+        along = shift[k] / (max(weight[k], _f(1e-9)) + total[k])
+        x[k], y[k], z[k] = X[k] + along * DX[k], Y[k] + along * DY[k], Z[k] + along * DZ[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _settle_normals(NX, NY, NZ, weight, FX, FY, FZ, n, x, y, z):
     for k in range(n):
         w = max(weight[k], _f(1e-9))
-        share = _ONE / (w + total[k])
-        along = shift[k] * share
         nx, ny, nz = FX[k] + w * NX[k], FY[k] + w * NY[k], FZ[k] + w * NZ[k]
         size = _ONE / math.sqrt(nx * nx + ny * ny + nz * nz)
-        ws = w * sigma[k]
+        x[k], y[k], z[k] = nx * size, ny * size, nz * size
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _settle_sigma(NX, NY, NZ, DX, DY, DZ, sigma_n, weight, total, variance, n, out):
+    """One standard deviation of the mean, along the ray."""
+    for k in range(n):
+        w = max(weight[k], _f(1e-9))
+        ws = w * sigma_n[k]
         slope = -(NX[k] * DX[k] + NY[k] * DY[k] + NZ[k] * DZ[k])
-        out[0, k], out[1, k], out[2, k] = X[k] + along * DX[k], Y[k] + along * DY[k], Z[k] + along * DZ[k]
-        out[3, k], out[4, k], out[5, k] = nx * size, ny * size, nz * size
-        out[6, k] = math.sqrt(variance[k] + ws * ws) * share / max(slope, _f(0.05))
+        out[k] = math.sqrt(variance[k] + ws * ws) / ((w + total[k]) * max(slope, _f(0.05)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _put(x, y, z, n, out):
+    """Three arrays to rows of `out` (n, 3)."""
+    flat = out.reshape(-1)
+    for k in range(n):
+        flat[3 * k] = x[k]
+        flat[3 * k + 1] = y[k]
+        flat[3 * k + 2] = z[k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -285,25 +312,15 @@ def _own(side, i, columns, n, row, X, Y, Z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _own_colours(side, i, columns, n, tint, clear, C):
-    part = side.rgb[3 * i * side.width : 3 * (i + 1) * side.width]
-    for k in range(n):
-        p = 3 * columns[k]
-        for c in range(3):
-            C[c, k] = part[p + c] * side.gain[c]
-        w = tint[k] * clear[k] * side.share
-        C[3, k] = w if w > _ZERO else _ZERO
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _plain(side, i, table, picture):
-    """A row of the view's own picture, balanced."""
+def _own_colours(side, i, columns, n, tint, clear, c0, c1, c2, w):
     part = side.rgb[3 * i * side.width : 3 * (i + 1) * side.width]
     g0, g1, g2 = side.gain[0], side.gain[1], side.gain[2]
-    for j in range(side.width):
-        picture[i, j, 0] = tone(part[3 * j] * g0, table)
-        picture[i, j, 1] = tone(part[3 * j + 1] * g1, table)
-        picture[i, j, 2] = tone(part[3 * j + 2] * g2, table)
+    for k in range(n):
+        p = np.uintp(3 * columns[k])
+        c0[k], c1[k], c2[k] = part[p] * g0, part[p + _ADD1] * g1, part[p + _ADD2] * g2
+    for k in range(n):
+        own = tint[k] * clear[k] * side.share
+        w[k] = own if own > _ZERO else _ZERO
 
 
 @by_rows(lambda _sides, _count, _view, _limits, marks, *_: marks.shape[0])
@@ -333,18 +350,19 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
     )  # fmt: skip
     rise, clear, cosine, tint = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     sigma_w, weight_w, along = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
-    C, out, settled = np.empty((count, 4, BLOCK), f), np.empty((4, BLOCK), f), np.empty((7, BLOCK), f)
+    C, code, green = np.empty((count, 4, BLOCK), f), np.empty(3 * BLOCK, np.int32), np.empty(BLOCK, np.int32)
     row, column, columns = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32), np.empty(BLOCK + 1, np.int32)
     ok, said = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.uint8)
     pictured = picture.shape[0] > 0
     for i in range(first, last):
         at = start[i]
         if pictured:
-            _plain(own, i, table, picture)
+            part = own.rgb[3 * i * own.width : 3 * (i + 1) * own.width]
+            encode_row(part, own.gain, table, code, picture[i].reshape(-1))
         for turn in range(2 if pictured else 1):
             j = 0
             while j < own.width:
-                n, j = listed(marks, bit if turn == 0 else 0, near, i, j, columns)
+                n, j = listed(marks[i], bit if turn == 0 else 0, near[i // TILE], j, columns)
                 if n == 0:
                     continue
                 _own(own, i, columns, n, row, X, Y, Z)
@@ -353,7 +371,7 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                 weigh(X, Y, Z, S, NX, NY, NZ, rise, own.centre, limits, n, cosine, SN, weight, tint)
                 _rays(X, Y, Z, own.centre, n, DX, DY, DZ)
                 if pictured:
-                    _own_colours(own, i, columns, n, tint, clear, C[0])
+                    _own_colours(own, i, columns, n, tint, clear, C[0, 0], C[0, 1], C[0, 2], C[0, 3])
                 for k in range(n):
                     shift[k] = total[k] = variance[k] = FX[k] = FY[k] = FZ[k] = _ZERO
                     said[k] = 0
@@ -373,26 +391,29 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                              weight_w, focal, limits, n, along, ok)
                     _add(ok, along, weight_w, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ)
                     if pictured:
-                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, C[slot], said)
+                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, C[slot, 0], C[slot, 1], C[slot, 2],
+                                 C[slot, 3], said)
                     slot += 1
                 if pictured:
-                    blend(C, count, limits.gloss, n, cosine, tint, out)
+                    blend(C, count, limits.gloss, n, cosine, tint, U, V, D, P)
+                    codes_of(U, table, n, row)
+                    codes_of(V, table, n, column)
+                    codes_of(D, table, n, green)
+                    line = picture[i].reshape(-1)
                     for k in range(n):
-                        r, g, b = tone(out[0, k], table), tone(out[1, k], table), tone(out[2, k], table)
                         c = columns[k]
-                        picture[i, c, 0], picture[i, c, 1], picture[i, c, 2] = r, g, b
+                        line[3 * c], line[3 * c + 1], line[3 * c + 2] = row[k], column[k], green[k]
                         marks[i, c] |= BLENDED if said[k] != 0 else 0
-                        if turn == 0:
-                            rgb[at + k, 0], rgb[at + k, 1], rgb[at + k, 2] = r, g, b
+                    if turn == 0:
+                        _put(row, column, green, n, rgb[at : at + n])
+                        for k in range(n):
                             seen[at + k] = said[k] | np.uint8(1 << view)
                 if turn == 0:
-                    _settle((X, Y, Z, NX, NY, NZ, SN), (DX, DY, DZ), weight, (shift, total, variance, FX, FY, FZ), n,
-                            settled)
-                    for k in range(n):
-                        for c in range(3):
-                            xyz[at + k, c] = settled[c, k]
-                            normal[at + k, c] = settled[3 + c, k]
-                        sigma[at + k] = settled[6, k]
+                    _settle_points(X, Y, Z, DX, DY, DZ, weight, shift, total, n, QX, QY, QZ)
+                    _put(QX, QY, QZ, n, xyz[at : at + n])
+                    _settle_normals(NX, NY, NZ, weight, FX, FY, FZ, n, MX, MY, MZ)
+                    _put(MX, MY, MZ, n, normal[at : at + n])
+                    _settle_sigma(NX, NY, NZ, DX, DY, DZ, SN, weight, total, variance, n, sigma[at : at + n])
                     at += n
 
 

@@ -394,7 +394,7 @@ def owners(first, last, there, score, group, out):
 
 @by_rows(lambda flat, *_: flat.shape[0])
 def mark(first, last, flat, raster, owner, edge, view, tile, marks, owned, close, near):
-    """Bits 1 in `marks` (H, W) for points in cells whose `owner` is `view`, 2 as well where the cell is at an `edge`.
+    """Bits in `marks` (H, W): 4 for points, 1 in cells whose `owner` is `view`, 2 as well where the cell is at an `edge`.
 
     `owned`, `close` (H,) count both; `near` (h, w), zeros, gets 1 for squares of `tile` pixels with an owned point.
     """
@@ -414,11 +414,14 @@ def mark(first, last, flat, raster, owner, edge, view, tile, marks, owned, close
             locate(X, Y, Z, raster, rows, cols, n, row, column)
             mine = 0
             for k in range(n):
-                if row[k] >= 0 and owner[row[k], column[k]] == view:
-                    bits = 3 if edge[row[k], column[k]] != 0 else 1
-                    part[k] = bits
+                if row[k] < 0:
+                    continue
+                part[k] = 4
+                if owner[row[k], column[k]] == view:
+                    at_edge = edge[row[k], column[k]] != 0
+                    part[k] = 7 if at_edge else 5
                     mine += 1
-                    close[i] += bits == 3
+                    close[i] += at_edge
                     near[i // tile, (col + k) // tile] = 1
             owned[i] += mine
 
@@ -461,7 +464,7 @@ def doubles(ab, xyz, normal, view, reach, sideways, near, cell_start, cell_row, 
 
 @by_rows(lambda marks, *_: marks.shape[0])
 def unmark(first, last, marks, bit, start, gone):
-    """Clear all bits of the pixels with `bit` in `marks` (H, W) that are `gone` (n,): row i's from start[i] on."""
+    """Leave bit 4 alone to the pixels with `bit` in `marks` (H, W) that are `gone` (n,): row i's from start[i] on."""
     for i in range(first, last):
         at = start[i]
         if at == start[i + 1]:
@@ -469,7 +472,7 @@ def unmark(first, last, marks, bit, start, gone):
         for j in range(marks.shape[1]):
             if (marks[i, j] & bit) != 0:
                 if gone[at]:
-                    marks[i, j] = 0
+                    marks[i, j] = 4
                 at += 1
 
 
