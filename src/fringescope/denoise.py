@@ -246,8 +246,7 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool
         others = [v for v, o in zip(sights, grids, strict=True) if o.view != g.view]
         bad, lost = np.zeros(g.reasons.shape, np.uint8), np.zeros(len(g.reasons), np.int64)
         if others:
-            filled = tuple((others + 8 * others[:1])[: max(8, len(others))])  # one length, so one compiled kernel
-            views.contradicted(own, filled, len(others), float(s.agree_sigma), float(s.agree_slack), bad, lost)
+            views.contradicted(own, tuple(others), float(s.agree_sigma), float(s.agree_slack), bad, lost)
         found.append((bad, lost))
     out = []
     for g, (bad, lost) in zip(grids, found, strict=True):  # all are judged before any loses a point

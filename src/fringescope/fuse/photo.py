@@ -17,7 +17,7 @@ from fringescope.types import F32, F64, U8, AnyArray, Bool, Grid, Photo, PixelFo
 
 _RGGB = cv2.COLOR_BayerBG2RGB_EA  # BayerRG of the GenICam names is RGGB, which OpenCV names after its second row
 
-_FEW = 20_000  # places that tell how two pictures differ
+_FEW = 10_000  # places that tell how two pictures differ
 
 
 def _tables() -> tuple[U8, F32]:
@@ -122,7 +122,7 @@ def decode_srgb(codes: U8) -> F32:
 def view_gains(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings) -> F64:
     """Factors (V, 3) that make the pictures agree where views overlap; their geometric mean is 1 per channel.
 
-    For each pair of views the mean of the middle half of the log ratios of what both see unsaturated (at some 20,000
+    For each pair of views the mean of the middle half of the log ratios of what both see unsaturated (at some 10,000
     places where their surfaces agree); then least squares over the pairs. Views without overlap keep 1, as do a grey
     picture's ratios of channels, and all if `harmonise` is off.
     """

@@ -24,7 +24,7 @@ from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, Cloud, Grid, Photo, Rig
 
 _SAMPLES = 60_000  # pixels of a view that tell its sampling
-_NEAR = 11  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
+_NEAR = 5  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Fused:
     `cloud` holds the fused points, view by view, row by row: those pixels of each view that make the one layer, on
     their own rays. `seen` (n,) has bit v set where view number v (in this order) sees the point too. `grids` are the
     views as they came; `marks` (H, W) have bit 1 where a view owns its pixel. `pictures` (H, W, 3) are sRGB: blended
-    from all views where the view owns the place and 160 pixels around, elsewhere the view's own, balanced.
+    from all views where the view owns the place and 64 pixels around, elsewhere the view's own, balanced.
     `spacing_mm` is each view's median sampling on the surface.
     """
 
@@ -196,7 +196,8 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     near = [np.zeros((-(-len(m) // fusing.TILE), -(-m.shape[1] // fusing.TILE)), np.uint8) for m in marks]
     owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))
     for i, g in enumerate(grids):
-        k.mark(_points(g)[1], raster.vector, owner, edge, i, fusing.TILE, marks[i], owned[i], close[i], near[i])
+        bits = np.where(owner == i, 5 + 2 * edge, 4).astype(np.uint8)
+        k.mark(_points(g)[1], raster.vector, bits, fusing.TILE, marks[i], owned[i], close[i], near[i])
     no_picture, nothing = np.empty((0, 0, 3), np.uint8), np.empty((0, 3), np.uint8)
     starts = _starts(close)
     xyz, normal, sigma = _room(int(starts[-1][-1]))

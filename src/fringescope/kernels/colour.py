@@ -47,12 +47,12 @@ def codes_of(light, table, n, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def encode_row(light, gain, table, scratch, out):
-    """A row of a picture (3 W,) times `gain` (3,) to the codes of `table` (4097,); `scratch` (n,) int32."""
-    m = len(scratch) // 3 * 3
-    factors = np.empty(m, np.float32)
-    for k in range(m):
-        factors[k] = gain[k % 3]
+def encode_row(light, factors, table, scratch, out):
+    """A row of a picture (3 W,) to the codes of `table` (4097,).
+
+    `factors` (m,), a multiple of three, are the gains over and over; `scratch` (m,) int32.
+    """
+    m = len(scratch)
     for first in range(0, len(light), m):
         n = min(m, len(light) - first)
         _numbers(light[first : first + n], factors, n, scratch)

@@ -54,28 +54,13 @@ class Limits(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def listed(marks, bit, near, first, out):
-    """Columns of a row of `marks` from `first` on, at most BLOCK, that have the `bit`; with bit 0: points near, not owned.
-
-    Returns how many, and the column to go on from. `near` (w,) tells which squares of TILE pixels to look at then.
-    """
-    n, j, W = 0, first, marks.shape[0]
-    if bit != 0:
-        while j < W and n < BLOCK:
-            out[n] = j
-            n += (marks[j] & bit) != 0
-            j += 1
-        return n, j
-    while j < W and n < BLOCK:
-        end = min((j // TILE + 1) * TILE, W)
-        if near[j // TILE] == 0:
-            j = end
-            continue
-        while j < end and n < BLOCK:
-            out[n] = j
-            n += (marks[j] & (POINT | OWNED)) == POINT
-            j += 1
-    return n, j
+def listed(marks, mask, wanted, first, out):
+    """Columns, from `first` on, of a part of a row of `marks` whose bits in `mask` are those `wanted`; how many."""
+    n = 0
+    for j in range(marks.shape[0]):
+        out[n] = first + j
+        n += (marks[j] & mask) == wanted
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -179,36 +164,56 @@ def _add(ok, along, weight, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, 
         FZ[k] += w * MZ[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _colours(side, U, V, ok, tint, clear, bit, n, c0, c1, c2, w, seen):
-    """Colour of the other view at (U, V), bilinear, and its weight; what it sees is marked with `bit`."""
-    W, H, rgb = side.width, side.height, side.rgb
-    right, below = np.uintp(3 if W > 1 else 0), np.uintp(3 * W if H > 1 else 0)
-    g0, g1, g2 = side.gain[0], side.gain[1], side.gain[2]
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _taps(U, V, ok, tint, clear, share, height, width, bit, n, place, fu, fv, weight, seen):
+    """The pixel up and left of (U, V), how far beyond it these are, and the weight; what is seen is marked with `bit`.
+    """
+    high_u, high_v = _f(max(width - 2, 0)), _f(max(height - 2, 0))
     for k in range(n):
-        w[k] = _ZERO
-        if not ok[k]:
+        u, v = (U[k] if ok[k] else _ZERO), (V[k] if ok[k] else _ZERO)
+        j, i = np.int32(min(u, high_u)), np.int32(min(v, high_v))
+        fu[k], fv[k] = u - _f(j), v - _f(i)
+        place[k] = 3 * (i * width + j)
+        own = tint[k] * clear[k] * share
+        weight[k] = own if ok[k] and own > _ZERO else _ZERO
+        seen[k] |= bit if ok[k] else np.uint8(0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _corners(rgb, place, right, below, weight, n, T):
+    """Three colours of four pixels each: T (12, n)."""
+    a0, a1, a2, b0, b1, b2 = T[0], T[1], T[2], T[3], T[4], T[5]
+    c0, c1, c2, d0, d1, d2 = T[6], T[7], T[8], T[9], T[10], T[11]
+    right, below = np.uintp(right), np.uintp(below)
+    for k in range(n):
+        if not weight[k] > _ZERO:
             continue
-        seen[k] |= bit
-        own = tint[k] * clear[k] * side.share
-        if not own > _ZERO:
-            continue
-        j, i = max(min(np.int32(U[k]), W - 2), 0), max(min(np.int32(V[k]), H - 2), 0)
-        fu, fv = U[k] - _f(j), V[k] - _f(i)
-        p = np.uintp(3 * (i * W + j))
-        q = p + below
-        a, b = rgb[p], rgb[q]
-        a, b = a + fu * (rgb[p + right] - a), b + fu * (rgb[q + right] - b)
-        c0[k] = (a + fv * (b - a)) * g0
-        p, q = p + _ADD1, q + _ADD1
-        a, b = rgb[p], rgb[q]
-        a, b = a + fu * (rgb[p + right] - a), b + fu * (rgb[q + right] - b)
-        c1[k] = (a + fv * (b - a)) * g1
-        p, q = p + _ADD1, q + _ADD1
-        a, b = rgb[p], rgb[q]
-        a, b = a + fu * (rgb[p + right] - a), b + fu * (rgb[q + right] - b)
-        c2[k] = (a + fv * (b - a)) * g2
-        w[k] = own
+        p = np.uintp(place[k])
+        a0[k], a1[k], a2[k] = rgb[p], rgb[p + _ADD1], rgb[p + _ADD2]
+        q = p + right
+        b0[k], b1[k], b2[k] = rgb[q], rgb[q + _ADD1], rgb[q + _ADD2]
+        p += below
+        c0[k], c1[k], c2[k] = rgb[p], rgb[p + _ADD1], rgb[p + _ADD2]
+        q = p + right
+        d0[k], d1[k], d2[k] = rgb[q], rgb[q + _ADD1], rgb[q + _ADD2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _bilinear(a, b, c, d, fu, fv, gain, n, out):
+    for k in range(n):
+        top, low = a[k] + fu[k] * (b[k] - a[k]), c[k] + fu[k] * (d[k] - c[k])
+        out[k] = (top + fv[k] * (low - top)) * gain
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _colours(side, U, V, ok, tint, clear, bit, n, place, fu, fv, T, c0, c1, c2, weight, seen):
+    """Colour of the other view at (U, V), bilinear, and its weight; what it sees is marked with `bit`."""
+    W, H = side.width, side.height
+    _taps(U, V, ok, tint, clear, side.share, H, W, bit, n, place, fu, fv, weight, seen)
+    _corners(side.rgb, place, 3 if W > 1 else 0, 3 * W if H > 1 else 0, weight, n, T)
+    _bilinear(T[0], T[3], T[6], T[9], fu, fv, side.gain[0], n, c0)
+    _bilinear(T[1], T[4], T[7], T[10], fu, fv, side.gain[1], n, c1)
+    _bilinear(T[2], T[5], T[8], T[11], fu, fv, side.gain[2], n, c2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -351,20 +356,33 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
     rise, clear, cosine, tint = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     sigma_w, weight_w, along = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     C, code, green = np.empty((count, 4, BLOCK), f), np.empty(3 * BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    T, place, factors = np.empty((12, BLOCK), f), np.empty(BLOCK, np.int64), np.empty(3 * BLOCK, f)
+    T[:] = _ZERO
+    for k in range(3 * BLOCK):
+        factors[k] = own.gain[k % 3]
     row, column, columns = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32), np.empty(BLOCK + 1, np.int32)
     ok, said = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.uint8)
     pictured = picture.shape[0] > 0
-    for i in range(first, last):
-        at = start[i]
-        if pictured:
-            part = own.rgb[3 * i * own.width : 3 * (i + 1) * own.width]
-            encode_row(part, own.gain, table, code, picture[i].reshape(-1))
-        for turn in range(2 if pictured else 1):
-            j = 0
-            while j < own.width:
-                n, j = listed(marks[i], bit if turn == 0 else 0, near[i // TILE], j, columns)
+    if pictured:
+        for i in range(first, last):
+            line = own.rgb[3 * i * own.width : 3 * (i + 1) * own.width]
+            encode_row(line, factors, table, code, picture[i].reshape(-1))
+    next_ = start[first : last + 1].copy()
+    for col in range(0, own.width, BLOCK):  # downwards, so that the other views' pixels are still in the caches
+        end = min(col + BLOCK, own.width)
+        for i in range(first, last):
+            for turn in range(2 if pictured and count > 1 else 1):
+                if turn == 0:
+                    n = listed(marks[i, col:end], bit, bit, col, columns)
+                else:
+                    n = 0
+                    for left in range(col, end, TILE):
+                        if near[i // TILE, left // TILE] != 0:
+                            part = marks[i, left : min(left + TILE, end)]
+                            n += listed(part, POINT | OWNED, POINT, left, columns[n:])
                 if n == 0:
                     continue
+                at = next_[i - first]
                 _own(own, i, columns, n, row, X, Y, Z)
                 _fetch(own, row, columns, n, S, P, Q, rise, clear)
                 decode(P, Q, n, NX, NY, NZ)
@@ -391,18 +409,18 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                              weight_w, focal, limits, n, along, ok)
                     _add(ok, along, weight_w, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ)
                     if pictured:
-                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, C[slot, 0], C[slot, 1], C[slot, 2],
-                                 C[slot, 3], said)
+                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, place, along, cosine, T, C[slot, 0],
+                                 C[slot, 1], C[slot, 2], C[slot, 3], said)
                     slot += 1
                 if pictured:
                     blend(C, count, limits.gloss, n, cosine, tint, U, V, D, P)
                     codes_of(U, table, n, row)
                     codes_of(V, table, n, column)
                     codes_of(D, table, n, green)
-                    line = picture[i].reshape(-1)
+                    target = picture[i].reshape(-1)
                     for k in range(n):
                         c = columns[k]
-                        line[3 * c], line[3 * c + 1], line[3 * c + 2] = row[k], column[k], green[k]
+                        target[3 * c], target[3 * c + 1], target[3 * c + 2] = row[k], column[k], green[k]
                         marks[i, c] |= BLENDED if said[k] != 0 else 0
                     if turn == 0:
                         _put(row, column, green, n, rgb[at : at + n])
@@ -414,7 +432,7 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                     _settle_normals(NX, NY, NZ, weight, FX, FY, FZ, n, MX, MY, MZ)
                     _put(MX, MY, MZ, n, normal[at : at + n])
                     _settle_sigma(NX, NY, NZ, DX, DY, DZ, SN, weight, total, variance, n, sigma[at : at + n])
-                    at += n
+                    next_[i - first] += n
 
 
 @by_rows(lambda _side, _limits, _step, _raster, _rows, _cols, weight, *_: weight.shape[0])

@@ -393,8 +393,8 @@ def owners(first, last, there, score, group, out):
 
 
 @by_rows(lambda flat, *_: flat.shape[0])
-def mark(first, last, flat, raster, owner, edge, view, tile, marks, owned, close, near):
-    """Bits in `marks` (H, W): 4 for points, 1 in cells whose `owner` is `view`, 2 as well where the cell is at an `edge`.
+def mark(first, last, flat, raster, bits, tile, marks, owned, close, near):
+    """Give points their cell's `bits` (rows, cols), in `marks` (H, W): 4 for points, 1 owned, 2 owned and at an edge.
 
     `owned`, `close` (H,) count both; `near` (h, w), zeros, gets 1 for squares of `tile` pixels with an owned point.
     """
@@ -402,7 +402,8 @@ def mark(first, last, flat, raster, owner, edge, view, tile, marks, owned, close
     f = np.float32
     X, Y, Z = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     row, column = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    rows, cols = owner.shape
+    rows, cols = bits.shape
+    table = bits.reshape(-1)
     for i in range(first, last):
         owned[i] = close[i] = 0
         for col in range(0, W, BLOCK):
@@ -412,18 +413,18 @@ def mark(first, last, flat, raster, owner, edge, view, tile, marks, owned, close
             if split(flat[i], col, n, X, Y, Z) == 0:
                 continue
             locate(X, Y, Z, raster, rows, cols, n, row, column)
-            mine = 0
             for k in range(n):
-                if row[k] < 0:
-                    continue
-                part[k] = 4
-                if owner[row[k], column[k]] == view:
-                    at_edge = edge[row[k], column[k]] != 0
-                    part[k] = 7 if at_edge else 5
-                    mine += 1
-                    close[i] += at_edge
-                    near[i // tile, (col + k) // tile] = 1
-            owned[i] += mine
+                if row[k] >= 0:
+                    part[k] = table[np.uintp(row[k] * cols + column[k])]
+            for left in range(col, col + n, tile):
+                mine = brink = 0
+                for k in range(left - col, min(left - col + tile, n)):
+                    mine += part[k] & 1
+                    brink += (part[k] >> 1) & 1
+                owned[i] += mine
+                close[i] += brink
+                if mine > 0:
+                    near[i // tile, left // tile] = 1
 
 
 @njit(cache=True, error_model="numpy")
