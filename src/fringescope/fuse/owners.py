@@ -22,6 +22,7 @@ from fringescope.types import F32, F64, U8, AnyArray, Bool, Grid, Pose, Rig
 _GROUP = 5  # cells; weights are averaged over three groups before ownership is settled
 _THIN = 300_000  # pixels that suffice to tell a view's weights, which are smooth
 _SAMPLES = 60_000  # pixels of a view that tell where it is
+EDGE = 128  #: bit of a cell near those of other views
 _REACH = (5, 5)  # cells around a border in which doubles are looked for, after points have moved
 
 
@@ -68,9 +69,8 @@ def raster_of(grids: Sequence[Grid], spacings: Sequence[float], rig: Rig, s: Fus
     return Raster(pose, low, cell, (rows, cols), depth, separation)
 
 
-def settle_owners(sides: Sequence[fusing.Side], limits: fusing.Limits, raster: Raster,
-                  there: U8) -> tuple[AnyArray, U8]:
-    """The view that owns each cell (rows, cols) int8, -1 if none, and whether others own cells near by.
+def settle_owners(sides: Sequence[fusing.Side], limits: fusing.Limits, raster: Raster, there: U8) -> U8:
+    """One plus the view that owns each cell (rows, cols), 0 if none; with EDGE where others own cells near by.
 
     `there` (V, rows, cols) tells which views have points in a cell.
     """
@@ -86,12 +86,20 @@ def settle_owners(sides: Sequence[fusing.Side], limits: fusing.Limits, raster: R
         k.bin_weights(weight.reshape(-1), row.reshape(-1), column.reshape(-1), _GROUP, total, count)
         smooth = cv2.blur(total, (3, 3)) / np.maximum(cv2.blur(count, (3, 3)), 1e-9)
         score[i] = np.pad(smooth, 1, mode="edge")
-    owner = np.empty(raster.shape, np.int8)
+    owner = np.empty(raster.shape, np.uint8)
     k.owners(there, score, _GROUP, owner)
-    number = (owner + 1).astype(np.uint8)
-    high = cv2.dilate(number, np.ones(_REACH, np.uint8))
-    number[number == 0] = 255
-    return owner, np.asarray(cv2.erode(number, np.ones(_REACH, np.uint8)) < high).astype(np.uint8)
+    window = np.ones(_REACH, np.uint8)
+    low = cv2.erode(np.where(owner == 0, np.uint8(255), owner), window)
+    owner[low < cv2.dilate(owner, window)] |= EDGE
+    return owner
+
+
+def bits_of(view: int) -> U8:
+    """The marks (256,) of points of view number `view` in cells of each number that `settle_owners` gives."""
+    out = np.full(256, fusing.POINT, np.uint8)
+    out[view + 1] |= fusing.OWNED
+    out[view + 1 | EDGE] |= fusing.OWNED | fusing.EDGE
+    return out
 
 
 def drop_doubles(xyz: F32, normal: F32, view: AnyArray, raster: Raster, rig: Rig, s: FuseSettings) -> Bool:
@@ -101,15 +109,10 @@ def drop_doubles(xyz: F32, normal: F32, view: AnyArray, raster: Raster, rig: Rig
     q = geometry.transform(raster.pose, xyz)
     ab = q[:, :2] / q[:, 2:]
     rows, cols = raster.shape
-    cell = np.clip(((ab - raster.low) / raster.cell).astype(np.int64), 0, [cols - 1, rows - 1])
-    index = cell[:, 1] * cols + cell[:, 0]
-    order = np.argsort(index, kind="stable")
-    unique, start = np.unique(index[order], return_index=True)
-    lookup = np.full(raster.shape, -1, np.int32)
-    lookup.ravel()[unique] = np.arange(len(unique))
-    out = np.zeros(len(order), np.bool_)
-    k.doubles(ab[order], xyz[order], normal[order], view[order], raster.separation, 1.05 * s.separation_mm,
-              3 * raster.cell * raster.depth, np.append(start, len(order)), unique // cols, unique % cols, lookup, out)
-    gone = np.zeros(len(order), np.bool_)
-    gone[order[out]] = True
-    return gone
+    index = np.clip(((ab - raster.low) / raster.cell).astype(np.int64), 0, [cols - 1, rows - 1]) @ [1, cols]
+    start, order = np.zeros(rows * cols + 2, np.int32), np.empty(len(index), np.int64)
+    k.sort_cells(index, start, order)
+    out = np.zeros(len(index), np.bool_)
+    k.doubles(ab, xyz, normal, view, raster.separation, 1.05 * s.separation_mm, 3 * raster.cell * raster.depth, index,
+              rows, cols, start, order, out)
+    return out

@@ -14,7 +14,7 @@ import numpy as np
 
 from fringescope import geometry
 from fringescope.errors import EmptyResultError, RigError
-from fringescope.fuse.owners import Raster, drop_doubles, raster_of, settle_owners
+from fringescope.fuse.owners import Raster, bits_of, drop_doubles, raster_of, settle_owners
 from fringescope.fuse.photo import LIGHT, SRGB, is_grey, view_gains
 from fringescope.kernels import colour as colours
 from fringescope.kernels import fusing
@@ -189,15 +189,15 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     there = np.zeros((V, *raster.shape), np.uint8)
     sides = [_side(g, p, gains[i], 1e-6 if grey[i] and not all(grey) else 1.0, spacings[i], raster, there[i], rig, s)
              for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
-    owner, edge = settle_owners(sides, limits, raster, there)
+    owner = settle_owners(sides, limits, raster, there)
     del there
     filled = tuple(sides)
     marks = [np.empty(g.sigma.shape, np.uint8) for g in grids]
     near = [np.zeros((-(-len(m) // fusing.TILE), -(-m.shape[1] // fusing.TILE)), np.uint8) for m in marks]
     owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))
     for i, g in enumerate(grids):
-        bits = np.where(owner == i, 5 + 2 * edge, 4).astype(np.uint8)
-        k.mark(_points(g)[1], raster.vector, bits, fusing.TILE, marks[i], owned[i], close[i], near[i])
+        k.mark(_points(g)[1], raster.vector, owner, bits_of(i), fusing.TILE, marks[i], owned[i], close[i],
+               near[i])
     no_picture, nothing = np.empty((0, 0, 3), np.uint8), np.empty((0, 3), np.uint8)
     starts = _starts(close)
     xyz, normal, sigma = _room(int(starts[-1][-1]))

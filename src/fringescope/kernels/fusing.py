@@ -15,7 +15,7 @@ from fringescope.kernels.surface import CODE, locate
 from fringescope.kernels.views import nearest, pick, project
 from fringescope.threads import by_rows
 
-BLOCK = 256  #: pixels that are worked on together
+BLOCK = 512  #: pixels that are worked on together
 OWNED, EDGE, POINT, BLENDED = 1, 2, 4, 8  #: bits of a view's marks
 TILE = 32  #: side, in pixels, of the squares of a picture that are blended or not
 

@@ -369,7 +369,7 @@ def bin_weights(weight, row, column, group, total, count):
 
 @by_rows(lambda there, *_: there.shape[1])
 def owners(first, last, there, score, group, out):
-    """The view (rows, cols) int8 with the largest score among those with a point `there` (V, rows, cols); -1 if none.
+    """One plus the view (rows, cols) with the largest score among those with a point `there` (V, rows, cols); 0: none.
 
     `score` (V, h, w) holds the middles of groups of `group` x `group` cells, one more all round; between them bilinear.
     """
@@ -389,12 +389,14 @@ def owners(first, last, there, score, group, out):
                     s += fy * ((1.0 - fx) * score[v, a + 1, b] + fx * score[v, a + 1, b + 1])
                     if s > best:
                         owner, best = v, s
-            out[i, j] = owner
+            out[i, j] = owner + 1
 
 
 @by_rows(lambda flat, *_: flat.shape[0])
-def mark(first, last, flat, raster, bits, tile, marks, owned, close, near):
-    """Give points their cell's `bits` (rows, cols), in `marks` (H, W): 4 for points, 1 owned, 2 owned and at an edge.
+def mark(first, last, flat, raster, owner, bits, tile, marks, owned, close, near):
+    """Give points the `bits` (256,) of their cell's `owner` (rows, cols) uint8, in `marks` (H, W).
+
+    4 are points, 1 is owned, 2 owned and at an edge.
 
     `owned`, `close` (H,) count both; `near` (h, w), zeros, gets 1 for squares of `tile` pixels with an owned point.
     """
@@ -402,8 +404,8 @@ def mark(first, last, flat, raster, bits, tile, marks, owned, close, near):
     f = np.float32
     X, Y, Z = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     row, column = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    rows, cols = bits.shape
-    table = bits.reshape(-1)
+    rows, cols = owner.shape
+    table = owner.reshape(-1)
     for i in range(first, last):
         owned[i] = close[i] = 0
         for col in range(0, W, BLOCK):
@@ -415,7 +417,7 @@ def mark(first, last, flat, raster, bits, tile, marks, owned, close, near):
             locate(X, Y, Z, raster, rows, cols, n, row, column)
             for k in range(n):
                 if row[k] >= 0:
-                    part[k] = table[np.uintp(row[k] * cols + column[k])]
+                    part[k] = bits[table[np.uintp(row[k] * cols + column[k])]]
             for left in range(col, col + n, tile):
                 mine = brink = 0
                 for k in range(left - col, min(left - col + tile, n)):
@@ -428,39 +430,52 @@ def mark(first, last, flat, raster, bits, tile, marks, owned, close, near):
 
 
 @njit(cache=True, error_model="numpy")
-def doubles(ab, xyz, normal, view, reach, sideways, near, cell_start, cell_row, cell_col, lookup, out):
+def sort_cells(cell, start, order):
+    """Points (n,) sorted by `cell`: those of cell c are `order`[`start`[c] : `start`[c + 1]], in the order they came.
+
+    `start` (cells + 2,) comes as zeros; its last number serves the counting.
+    """
+    for c in cell:
+        start[c + 2] += 1
+    for c in range(2, len(start)):
+        start[c] += start[c - 1]
+    for k in range(len(cell)):
+        order[start[cell[k] + 1]] = k
+        start[cell[k] + 1] += 1
+
+
+@njit(cache=True, error_model="numpy")
+def doubles(ab, xyz, normal, view, reach, sideways, near, cell, rows, cols, start, order, out):
     """Which points (n,) lie too near a kept point of another view.
 
     Too near is less than `reach` in the plane `ab` (n, 2), or a distance below `near` in space of which less than
     `sideways` lies in the tangent plane of one of the two (`xyz`, `normal` (n, 3), mm).
 
-    Points come sorted by cell: cell k holds cell_start[k] to cell_start[k + 1], at (cell_row[k], cell_col[k]), and
-    `lookup` (rows, cols) is k or -1; cells are at least `reach` wide. The first kept point wins.
+    Points lie in cells, at least `reach` wide, of a raster of `rows` x `cols`; `start` and `order` are those of
+    `sort_cells`. Cell by cell, the first kept point wins.
     """
-    for k in range(cell_row.shape[0]):
-        for a in range(cell_start[k], cell_start[k + 1]):
-            for dr in range(-1, 2):
-                for dc in range(-1, 2):
-                    r, c = cell_row[k] + dr, cell_col[k] + dc
-                    if out[a] or r < 0 or c < 0 or r >= lookup.shape[0] or c >= lookup.shape[1] or lookup[r, c] < 0:
-                        continue
-                    m = lookup[r, c]
-                    for b in range(cell_start[m], cell_start[m + 1]):
-                        if view[b] == view[a] or out[b]:
-                            continue
-                        x, y = ab[a, 0] - ab[b, 0], ab[a, 1] - ab[b, 1]
-                        if x * x + y * y < reach * reach:
-                            out[a] = True
-                            break
-                        x, y, z = xyz[a, 0] - xyz[b, 0], xyz[a, 1] - xyz[b, 1], xyz[a, 2] - xyz[b, 2]
-                        far = x * x + y * y + z * z
-                        if far > near * near:
-                            continue
-                        up = x * normal[a, 0] + y * normal[a, 1] + z * normal[a, 2]
-                        above = x * normal[b, 0] + y * normal[b, 1] + z * normal[b, 2]
-                        if far - max(up * up, above * above) < sideways * sideways:
-                            out[a] = True
-                            break
+    for a in order:
+        row, col = cell[a] // cols, cell[a] % cols
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            if out[a]:
+                break
+            for m in range(start[r * cols + max(col - 1, 0)], start[r * cols + min(col + 1, cols - 1) + 1]):
+                b = order[m]
+                if view[b] == view[a] or out[b]:
+                    continue
+                x, y = ab[a, 0] - ab[b, 0], ab[a, 1] - ab[b, 1]
+                if x * x + y * y < reach * reach:
+                    out[a] = True
+                    break
+                x, y, z = xyz[a, 0] - xyz[b, 0], xyz[a, 1] - xyz[b, 1], xyz[a, 2] - xyz[b, 2]
+                far = x * x + y * y + z * z
+                if far > near * near:
+                    continue
+                up = x * normal[a, 0] + y * normal[a, 1] + z * normal[a, 2]
+                above = x * normal[b, 0] + y * normal[b, 1] + z * normal[b, 2]
+                if far - max(up * up, above * above) < sideways * sideways:
+                    out[a] = True
+                    break
 
 
 @by_rows(lambda marks, *_: marks.shape[0])
