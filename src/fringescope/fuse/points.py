@@ -24,7 +24,7 @@ from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, Cloud, Grid, Photo, Rig
 
 _SAMPLES = 60_000  # pixels of a view that tell its sampling
-_NEAR = 5  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
+_NEAR = 3  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Fused:
     `cloud` holds the fused points, view by view, row by row: those pixels of each view that make the one layer, on
     their own rays. `seen` (n,) has bit v set where view number v (in this order) sees the point too. `grids` are the
     views as they came; `marks` (H, W) have bit 1 where a view owns its pixel. `pictures` (H, W, 3) are sRGB: blended
-    from all views where the view owns the place and 64 pixels around, elsewhere the view's own, balanced.
+    from all views where the view owns the place and 32 pixels around at least, elsewhere the view's own, balanced.
     `spacing_mm` is each view's median sampling on the surface.
     """
 

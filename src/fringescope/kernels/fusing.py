@@ -64,6 +64,20 @@ def listed(marks, mask, wanted, first, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _touch(side, row, column, n, coloured):
+    """Reads every fourth of the pixels that will be needed, whose lines then come to the caches side by side."""
+    some = _ZERO
+    for k in range(0, n, 4):
+        if row[k] >= 0:
+            p = np.uintp(row[k] * side.width + column[k])
+            q = p + p + p
+            some += side.xyz[q] + side.sigma[p] + _f(side.code[p + p]) + _f(side.rise[p])
+            if coloured:
+                some += side.rgb[q]
+    return some
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fetch(side, row, column, n, S, P, Q, rise, clear):
     """Sigma, code of the normal, rise and clearness at pixels (row, column); row -1 leaves sigma NaN."""
     W = side.width
@@ -367,6 +381,7 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
         for i in range(first, last):
             line = own.rgb[3 * i * own.width : 3 * (i + 1) * own.width]
             encode_row(line, factors, table, code, picture[i].reshape(-1))
+    touched = _ZERO
     next_ = start[first : last + 1].copy()
     for col in range(0, own.width, BLOCK):  # downwards, so that the other views' pixels are still in the caches
         end = min(col + BLOCK, own.width)
@@ -400,6 +415,7 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                     other = sides[w]
                     project(X, Y, Z, other.pose, other.lens, n, U, V, D)
                     nearest(U, V, D, other.height, other.width, _ZERO, n, row, column)
+                    touched += _touch(other, row, column, n, pictured)
                     pick(row, column, other.width, other.xyz, n, QX, QY, QZ)
                     _fetch(other, row, column, n, S, P, Q, rise, clear)
                     decode(P, Q, n, MX, MY, MZ)
@@ -433,6 +449,7 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                     _put(MX, MY, MZ, n, normal[at : at + n])
                     _settle_sigma(NX, NY, NZ, DX, DY, DZ, SN, weight, total, variance, n, sigma[at : at + n])
                     next_[i - first] += n
+    code[0] = np.int32(touched > _ZERO)  # so that no compiler takes the reading away
 
 
 @by_rows(lambda _side, _limits, _step, _raster, _rows, _cols, weight, *_: weight.shape[0])
