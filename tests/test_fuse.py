@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fringescope import fuse, geometry
+from fringescope import denoise, fuse, geometry
 from fringescope.errors import EmptyResultError, RigError
-from fringescope.settings import FuseSettings
-from fringescope.types import Grid, Photo
+from fringescope.settings import FuseSettings, Settings
+from fringescope.types import Grid, Photo, Rig
 from tests import fuse_scenes as scenes
 from tests.reference.colour import de2000, lab
 
@@ -211,6 +211,35 @@ def test_a_grey_picture_takes_no_colour_away(flat):
     only = [Photo(p.camera, np.repeat(p.rgb.mean(2, keepdims=True), 3, 2), p.saturated) for p in photos]
     c = fuse.cloud(fuse.merge(grids, only, r))
     assert (c.rgb[:, 0] == c.rgb[:, 2]).all()
+
+
+def test_views_of_other_sizes_in_arrays_of_any_kind(flat):
+    """Strided, Fortran-ordered and read-only arrays give what plain ones give; sizes may differ between views."""
+    r, hit, grids, photos, _ = flat
+    camera = scenes.rig(3, 96, 72).cameras[1]
+    other = Rig(r.projector, (r.cameras[0], camera, r.cameras[2]))
+    views = [grids[0], scenes.grid(other, 1, hit, 0.005, np.random.default_rng(7)), grids[2]]
+    pictures = [scenes.photo(g) for g in views]
+    plain = fuse.merge(views, pictures, other)
+    wide = np.repeat(views[0].xyz, 2, axis=1)
+    fixed = views[2].sigma.copy()
+    fixed.setflags(write=False)
+    odd = [
+        Grid(0, views[0].camera, wide[:, ::2], np.asfortranarray(views[0].sigma), views[0].reasons),
+        views[1],
+        Grid(2, views[2].camera, views[2].xyz, fixed, views[2].reasons),
+    ]
+    odd_pictures = [Photo(p.camera, np.asfortranarray(p.rgb), p.saturated) for p in pictures]
+    fused = fuse.merge(odd, odd_pictures, other)
+    for name in ("xyz", "normals", "rgb", "sigma", "view"):
+        np.testing.assert_array_equal(getattr(fused.cloud, name), getattr(plain.cloud, name))
+    assert set(np.unique(plain.cloud.view)) <= {0, 1, 2}
+    inner = (np.abs(plain.cloud.xyz[:, :2]) < [12, 7]).all(1)
+    assert np.std(hit.error(plain.cloud.xyz.astype(float))[inner]) < 0.0052 / np.sqrt(2)
+    every = fuse.all_points(odd, odd_pictures, other)
+    np.testing.assert_array_equal(every.xyz, np.concatenate([g.xyz[g.valid] for g in views]))
+    for a, b in zip(denoise.agree(odd, other, Settings().denoise), views, strict=True):
+        np.testing.assert_array_equal(a.reasons, b.reasons)
 
 
 def empty(g):

@@ -238,7 +238,7 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool
     """Where views overlap: a point in front of what another view sees through it, and that no view confirms, goes.
 
     A point confirmed by any other view stays; one that lies behind another view's surface is hidden there and stays.
-    `in_place` writes into the grids' own arrays; else a grid that loses points is copied.
+    A grid that loses nothing comes back as it is; one that loses points is copied, or with `in_place` written to.
     """
     sights = [_sight(g, rig) for g in grids]
     found = []
@@ -250,9 +250,11 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool
         found.append((bad, lost))
     out = []
     for g, (bad, lost) in zip(grids, found, strict=True):  # all are judged before any loses a point
-        kept = g if in_place or not lost.any() else replace(g, xyz=g.xyz.copy(), sigma=g.sigma.copy(),
-                                                            reasons=g.reasons.copy())
-        views.blank(bad, lost, np.uint16(Reason.VIEWS_DISAGREE), kept.xyz, kept.sigma, kept.reasons)
+        kept = g
+        if lost.any():
+            if not in_place:
+                kept = replace(g, xyz=g.xyz.copy(), sigma=g.sigma.copy(), reasons=g.reasons.copy())
+            views.blank(bad, lost, np.uint16(Reason.VIEWS_DISAGREE), kept.xyz, kept.sigma, kept.reasons)
         out.append(kept)
     return tuple(out)
 

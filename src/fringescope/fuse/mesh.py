@@ -15,7 +15,7 @@ from fringescope.fuse.levels import Sheet, removable, simplify, triangulations
 from fringescope.fuse.points import Fused
 from fringescope.kernels import mesh as k
 from fringescope.kernels.fusing import OWNED
-from fringescope.kernels.surface import number
+from fringescope.kernels.ownership import number
 from fringescope.settings import MeshSettings
 from fringescope.types import F32, U8, AnyArray, Bool, Rig, Surface, SurfacePart
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from fringescope import geometry
 from fringescope.kernels import fusing
-from fringescope.kernels import surface as k
+from fringescope.kernels import ownership as k
 from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Grid, Pose, Rig
 
@@ -102,7 +102,7 @@ def bits_of(view: int) -> U8:
     return out
 
 
-def drop_doubles(xyz: F32, normal: F32, view: AnyArray, raster: Raster, rig: Rig, s: FuseSettings) -> Bool:
+def drop_doubles(xyz: F32, normal: F32, view: AnyArray, raster: Raster, s: FuseSettings) -> Bool:
     """Which points (n,) near borders lie within the separation of another view's point that stays."""
     if not len(xyz):
         return np.zeros(0, np.bool_)

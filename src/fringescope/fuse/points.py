@@ -17,7 +17,7 @@ from fringescope.errors import EmptyResultError, RigError
 from fringescope.fuse.owners import Raster, bits_of, drop_doubles, raster_of, settle_owners
 from fringescope.fuse.photo import LIGHT, SRGB, is_grey, view_gains
 from fringescope.kernels import colour as colours
-from fringescope.kernels import fusing
+from fringescope.kernels import fusing, ownership
 from fringescope.kernels import surface as k
 from fringescope.kernels.views import constant
 from fringescope.settings import FuseSettings
@@ -65,7 +65,8 @@ def _check(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig) -> None:
         if g.sigma.shape != p.rgb.shape[:2]:
             raise RigError(f"camera '{g.camera}': points on {g.sigma.shape[1]} x {g.sigma.shape[0]} pixels, picture of "
                            f"{p.rgb.shape[1]} x {p.rgb.shape[0]}; needed the same size")
-    if not any(bool((g.reasons[i : i + 256] == 0).any()) for g in grids for i in range(0, len(g.reasons), 256)):
+    bands = (g.reasons[i : i + 256] for g in grids for i in range(0, len(g.reasons), 256))
+    if not any(bool((band == 0).any()) for band in bands):
         raise EmptyResultError("no view has a single valid point: nothing to fuse; see the reasons per view")
 
 
@@ -119,7 +120,7 @@ def _spacing(grid: Grid) -> float:
     """Median sampling of a view on the surface, mm, from some of its pixels; 0 without neighbours."""
     H, W = grid.sigma.shape
     step = max(1, int(math.sqrt(H * W / _SAMPLES)))
-    out = np.empty((-(-H // step), -(-W // step)), np.float32)
+    out: F32 = np.empty((-(-H // step), -(-W // step)), np.float32)
     k.spacing(constant(grid.xyz), step, out)
     found = out[np.isfinite(out)]
     return float(np.median(found)) if len(found) else 0.0
@@ -146,7 +147,8 @@ def _side(grid: Grid, photo: Photo, gain: F64, share: float, spacing: float, ras
         colours.clearness(constant(photo.saturated), s.highlight_pixels, clear)
     return fusing.Side(
         constant(grid.xyz).reshape(-1), constant(grid.sigma).reshape(-1), constant(code).reshape(-1),
-        constant(rise).reshape(-1), constant(photo.rgb).reshape(-1), gain.astype(np.float32), constant(clear).reshape(-1), np.float32(share),
+        constant(rise).reshape(-1), constant(photo.rgb).reshape(-1), gain.astype(np.float32),
+        constant(clear).reshape(-1), np.float32(share),
         centre.astype(np.float32), H, W, geometry.pose_vector(camera.pose), geometry.lens_vector(camera.lens),
     )
 
@@ -162,7 +164,7 @@ def _starts(counts: Sequence[AnyArray]) -> list[AnyArray]:
     out, first = [], 0
     for c in counts:
         out.append(np.concatenate([[first], first + np.cumsum(c)]).astype(np.int64))
-        first = int(out[-1][-1])
+        first += int(c.sum())
     return out
 
 
@@ -196,8 +198,8 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     near = [np.zeros((-(-len(m) // fusing.TILE), -(-m.shape[1] // fusing.TILE)), np.uint8) for m in marks]
     owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))
     for i, g in enumerate(grids):
-        k.mark(_points(g)[1], raster.vector, owner, bits_of(i), fusing.TILE, marks[i], owned[i], close[i],
-               near[i])
+        ownership.mark(_points(g)[1], raster.vector, owner, bits_of(i), fusing.TILE, marks[i], owned[i], close[i],
+                       near[i])
     no_picture, nothing = np.empty((0, 0, 3), np.uint8), np.empty((0, 3), np.uint8)
     starts = _starts(close)
     xyz, normal, sigma = _room(int(starts[-1][-1]))
@@ -205,10 +207,10 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
         fusing.fuse(filled, V, i, limits, marks[i], fusing.EDGE, near[i], starts[i], SRGB, xyz, normal, sigma, nothing,
                     nothing[:, 0], no_picture)
     views = np.repeat(np.arange(V, dtype=np.int16), [int(c.sum()) for c in close])
-    gone = drop_doubles(xyz, normal, views, raster, rig, s)
+    gone = drop_doubles(xyz, normal, views, raster, s)
     for i in range(V):
-        k.unmark(marks[i], fusing.EDGE, starts[i], gone)
-        k.count_marked(marks[i], fusing.OWNED, owned[i])
+        ownership.unmark(marks[i], fusing.EDGE, starts[i], gone)
+        ownership.count_marked(marks[i], fusing.OWNED, owned[i])
     starts = _starts(owned)
     n = int(starts[-1][-1])
     xyz, normal, sigma = _room(n)

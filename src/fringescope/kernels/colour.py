@@ -135,7 +135,7 @@ def share_codes(first, last, background, scale_, near_full, out, saturated):
 def clearness(first, last, saturated, width, out):
     """How far (H, W) a pixel is from saturated ones and the picture's edge: 0 on them, smoothly to 255 at `width`."""
     H, W = saturated.shape
-    reach = int(math.ceil(width))
+    reach = math.ceil(width)
     squared = np.empty(W, np.float32)
     side = np.empty(W, np.int32)
     for i in range(first, last):

@@ -160,7 +160,8 @@ def _compare(own, ray, depth, other, cosine, sigma_w, weight, inverse_focal, lim
         limit = limits.agree_sigma * math.sqrt(sigma[k] * sigma[k] + sigma_w[k] * sigma_w[k]) + limits.agree_mm
         reach = depth[k] * inverse_focal / max(cosine[k], _f(0.05)) + limit
         slope = (mx * DX[k] + my * DY[k] + mz * DZ[k]) * inverse
-        ok[k] = (weight[k] > _ZERO) & (size >= _ONE) & (abs(s) <= limit) & (cx * cx + cy * cy + cz * cz <= reach * reach)
+        near = cx * cx + cy * cy + cz * cz <= reach * reach
+        ok[k] = (weight[k] > _ZERO) & (size >= _ONE) & (abs(s) <= limit) & near
         shift[k] = s / slope if slope < _f(-0.05) else _f(np.nan)
 
 
@@ -180,8 +181,7 @@ def _add(ok, along, weight, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def _taps(U, V, ok, tint, clear, share, height, width, bit, n, place, fu, fv, weight, seen):
-    """The pixel up and left of (U, V), how far beyond it these are, and the weight; what is seen is marked with `bit`.
-    """
+    """The pixel up and left of (U, V), how far beyond it they are, and the weight; what is seen gets `bit`."""
     high_u, high_v = _f(max(width - 2, 0)), _f(max(height - 2, 0))
     for k in range(n):
         u, v = (U[k] if ok[k] else _ZERO), (V[k] if ok[k] else _ZERO)
@@ -454,11 +454,11 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
 
 @by_rows(lambda _side, _limits, _step, _raster, _rows, _cols, weight, *_: weight.shape[0])
 def thinned(first, last, side, limits, step, raster, rows, cols, weight, row_out, column_out):
-    """Weights (h, w) of every `step`-th point, and the cells (row, column) of the raster that they lie in, row -1: none.
-    """
+    """Weights (h, w) of every `step`-th point, and its cell (row, column) of the raster; row -1: none."""
     f = np.float32
     X, Y, Z, S = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
-    NX, NY, NZ, P, Q = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    NX, NY, NZ = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    P, Q = np.empty(BLOCK, f), np.empty(BLOCK, f)
     rise, clear, cosine, sigma_n = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     tint, row, columns = np.empty(BLOCK, f), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     for i in range(first, last):
