@@ -215,7 +215,7 @@ def test_a_grey_picture_takes_no_colour_away(flat):
 
 def test_views_of_other_sizes_in_arrays_of_any_kind(flat):
     """Strided, Fortran-ordered and read-only arrays give what plain ones give; sizes may differ between views."""
-    r, hit, grids, photos, _ = flat
+    r, hit, grids, _, _ = flat
     camera = scenes.rig(3, 96, 72).cameras[1]
     other = Rig(r.projector, (r.cameras[0], camera, r.cameras[2]))
     views = [grids[0], scenes.grid(other, 1, hit, 0.005, np.random.default_rng(7)), grids[2]]

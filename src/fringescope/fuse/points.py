@@ -188,14 +188,15 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     grey = [is_grey(p) for p in photos]
     spacings = [_spacing(g) for g in grids]
     raster = raster_of(grids, spacings, rig, s)
-    there = np.zeros((V, *raster.shape), np.uint8)
+    there: U8 = np.zeros((V, *raster.shape), np.uint8)
     sides = [_side(g, p, gains[i], 1e-6 if grey[i] and not all(grey) else 1.0, spacings[i], raster, there[i], rig, s)
              for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
     owner = settle_owners(sides, limits, raster, there)
     del there
     filled = tuple(sides)
     marks = [np.empty(g.sigma.shape, np.uint8) for g in grids]
-    near = [np.zeros((-(-len(m) // fusing.TILE), -(-m.shape[1] // fusing.TILE)), np.uint8) for m in marks]
+    squares = [tuple(-(-n // fusing.TILE) for n in g.reasons.shape) for g in grids]
+    near = [np.zeros(shape, np.uint8) for shape in squares]
     owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))
     for i, g in enumerate(grids):
         ownership.mark(_points(g)[1], raster.vector, owner, bits_of(i), fusing.TILE, marks[i], owned[i], close[i],
