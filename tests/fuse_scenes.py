@@ -131,3 +131,15 @@ def photo(g, gain=(1.0, 1.0, 1.0), rng=None, noise=0.0):
     if rng is not None:
         rgb = rgb + noise * rng.standard_normal(rgb.shape)
     return Photo(g.camera, rgb.astype(np.float32), np.zeros(g.sigma.shape, bool))
+
+
+def seen(fused):
+    """Which views see the points (H, W) that each view owns; 0 elsewhere."""
+    out, first = [], 0
+    for own in fused.owned:
+        n = int(own.sum())
+        one = np.zeros(own.shape, np.uint8)
+        one[own] = fused.seen[first : first + n]
+        out.append(one)
+        first += n
+    return out

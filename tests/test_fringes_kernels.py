@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fringescope import calm, geometry, phase
 from fringescope.errors import CaptureError
 from fringescope.kernels import fringes as kernels
-from fringescope.kernels import regions, votes
+from fringescope.kernels import regions, views, votes
 from fringescope.types import FringeSet, NoiseModel
 from tests import fuse_scenes as scenes
 from tests.reference import fringes as reference
@@ -462,18 +462,23 @@ def test_cross_examination_equals_its_twin(seed):
     xyz = own.xyz + np.where(rng.random(own.sigma.shape) < 0.3, rng.normal(0, 3, own.sigma.shape), 0)[..., None]
     xyz = xyz.astype(np.float32)
     camera = r.cameras[1]
-    confirmed, denied = np.zeros(own.sigma.shape, np.uint8), np.zeros(own.sigma.shape, np.uint8)
-    regions.cross_examine(
-        xyz, own.sigma, other.xyz, other.sigma, camera.pose.R, camera.pose.t, geometry.lens_vector(camera.lens),
-        6.0, 0.5, confirmed, denied,
+    mine, others = (
+        views.View(x.reshape(-1), s.reshape(-1), *s.shape, geometry.pose_vector(c.pose), geometry.lens_vector(c.lens))
+        for x, s, c in ((xyz, own.sigma, r.cameras[0]), (other.xyz, other.sigma, camera))
     )
+    bad, lost = np.zeros(own.sigma.shape, np.uint8), np.zeros(len(own.sigma), np.int64)
+    views.contradicted(mine, (others,), 6.0, 0.5, bad, lost)
+    said = np.zeros(own.sigma.shape, int)
+    for i, j in np.argwhere(np.isfinite(xyz[..., 0])):
+        said[i, j] = views.examine(*map(float, xyz[i, j]), float(own.sigma[i, j]), others, 6.0, 0.5)
     want = np.zeros(own.sigma.shape, int)
     for i, j in np.argwhere(np.isfinite(xyz[..., 0])):
         want[i, j] = slow.cross_examine(
             xyz[i, j], own.sigma[i, j], other.xyz, other.sigma, camera.pose, camera.lens, 6.0, 0.5
         )
-    np.testing.assert_array_equal(confirmed, want == 1)
-    np.testing.assert_array_equal(denied, want == -1)
+    np.testing.assert_array_equal(said, want)
+    np.testing.assert_array_equal(bad != 0, want == -1)
+    np.testing.assert_array_equal(lost, bad.sum(1))
     assert {-1, 0, 1} <= set(want.ravel())
 
 

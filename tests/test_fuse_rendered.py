@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from fringescope import export, fuse, geometry, pipeline, store
 from fringescope.settings import Settings
+from tests import fuse_scenes as scenes
 from tests.reference import triangles
 from tests.reference.colour import de2000, lab
 
@@ -31,7 +32,7 @@ def plane():
     truth = json.loads((DATA / "truth" / "plane.json").read_text())
     c = fuse.cloud(fused)
     e = 1e3 * (c.xyz - truth["point"]) @ np.array(truth["normal"])
-    return rig, fused, c, e, np.concatenate([s[o] for s, o in zip(fused.seen, fused.owned, strict=True)])
+    return rig, fused, c, e, fused.seen
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +81,10 @@ def test_one_layer(tissue):
 
 def test_views_tell_the_same_colour_where_they_overlap(tissue):
     rig, fused, _ = tissue
+    seen = scenes.seen(fused)
     for a in range(3):
         for b in range(a):
-            shared = ((fused.seen[a] >> b) & 1) > 0
+            shared = ((seen[a] >> b) & 1) > 0
             uv = geometry.project(rig.cameras[b], fused.grids[a].xyz[shared])[::7]
             other = [map_coordinates(fused.pictures[b][..., k].astype(float), uv.T[::-1], order=1) for k in range(3)]
             difference = de2000(lab(fused.pictures[a][shared][::7]), lab(np.stack(other, -1)))

@@ -16,7 +16,7 @@ import numpy as np
 
 from fringescope import calm, geometry, memory
 from fringescope.kernels import regions as k
-from fringescope.kernels import screens
+from fringescope.kernels import screens, views
 from fringescope.settings import DenoiseSettings
 from fringescope.types import (
     F32,
@@ -283,30 +283,38 @@ def _slopes(d: Direction, reasons: U16, decoded: Decoded, rig: Rig | None) -> F6
     return np.full((2, 2, 3), usual or 1.0)
 
 
-def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings) -> tuple[Grid, ...]:
+def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool = False) -> tuple[Grid, ...]:
     """Where views overlap: a point in front of what another view sees through it, and that no view confirms, goes.
 
     A point confirmed by any other view stays; one that lies behind another view's surface is hidden there and stays.
+    A grid that loses nothing comes back as it is; one that loses points is copied, or with `in_place` written to.
     """
+    sights = [_sight(g, rig) for g in grids]
+    found = []
+    for g, own in zip(grids, sights, strict=True):
+        others = [v for v, o in zip(sights, grids, strict=True) if o.view != g.view]
+        bad, lost = np.zeros(g.reasons.shape, np.uint8), np.zeros(len(g.reasons), np.int64)
+        if others:
+            views.contradicted(own, tuple(others), float(s.agree_sigma), float(s.agree_slack), bad, lost)
+        found.append((bad, lost))
     out = []
-    for g in grids:
-        H, W = g.reasons.shape
-        confirmed, denied = np.zeros((H, W), np.uint8), np.zeros((H, W), np.uint8)
-        for o in grids:
-            if o.view == g.view:
-                continue
-            camera = rig.cameras[o.view]
-            k.cross_examine(
-                g.xyz, g.sigma, o.xyz, o.sigma, camera.pose.R, camera.pose.t, geometry.lens_vector(camera.lens),
-                s.agree_sigma, s.agree_slack, confirmed, denied,
-            )
-        bad = (denied > 0) & (confirmed == 0)
-        reasons, xyz, sigma = g.reasons.copy(), g.xyz.copy(), g.sigma.copy()
-        reasons[bad] |= np.uint16(Reason.VIEWS_DISAGREE)
-        xyz[bad] = np.nan
-        sigma[bad] = np.nan
-        out.append(replace(g, xyz=xyz, sigma=sigma, reasons=reasons))
+    for g, (bad, lost) in zip(grids, found, strict=True):  # all are judged before any loses a point
+        kept = g
+        if lost.any():
+            if not in_place:
+                kept = replace(g, xyz=g.xyz.copy(), sigma=g.sigma.copy(), reasons=g.reasons.copy())
+            views.blank(bad, lost, np.uint16(Reason.VIEWS_DISAGREE), kept.xyz, kept.sigma, kept.reasons)
+        out.append(kept)
     return tuple(out)
+
+
+def _sight(grid: Grid, rig: Rig) -> views.View:
+    """A grid as the kernels look at it."""
+    H, W = grid.reasons.shape
+    camera = rig.cameras[grid.view]
+    xyz, sigma = views.constant(grid.xyz), views.constant(grid.sigma)
+    return views.View(xyz.reshape(-1), sigma.reshape(-1), H, W, geometry.pose_vector(camera.pose),
+                      geometry.lens_vector(camera.lens))
 
 
 def interpolated(decoded: Decoded, pixel_format: PixelFormat) -> bool:

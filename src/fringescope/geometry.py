@@ -24,6 +24,11 @@ def lens_vector(lens: Lens) -> F64:
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], *d], dtype=np.float64)
 
 
+def pose_vector(pose: Pose) -> F64:
+    """The twelve numbers that kernels take: R row by row, then t."""
+    return np.concatenate([pose.R.ravel(), pose.t])
+
+
 def without_distortion(lens: Lens) -> Lens:
     """The same lens as the plain pinhole of the paper's equations 2 and 6."""
     return Lens(lens.width, lens.height, lens.K, np.zeros(5))

@@ -16,7 +16,8 @@ from fringescope.fuse.delaunay import Triangulation, along_curve, snapped
 from fringescope.fuse.levels import Sheet, removable, simplify
 from fringescope.fuse.points import Fused
 from fringescope.kernels import mesh as k
-from fringescope.kernels import surface as ks
+from fringescope.kernels.fusing import OWNED
+from fringescope.kernels.ownership import number
 from fringescope.settings import MeshSettings
 from fringescope.types import F32, F64, I32, U8, AnyArray, Bool, Rig, Surface, SurfacePart
 
@@ -53,25 +54,24 @@ class _Points:
 
 def _points(fused: Fused, rig: Rig, s: MeshSettings) -> _Points:
     """Owned points, strided where there are more than `max_points`."""
-    total = sum(int(np.count_nonzero(o)) for o in fused.owned)
-    stride = max(1, math.ceil(math.sqrt(total / s.max_points)))
+    stride = max(1, math.ceil(math.sqrt(len(fused.cloud) / s.max_points)))
     parts: list[tuple[AnyArray, ...]] = []
-    for i, grid in enumerate(fused.grids):
-        owned = np.ascontiguousarray(fused.owned[i][::stride, ::stride])
-        rows, cols = np.divmod(np.flatnonzero(owned).astype(np.int32), np.int32(max(owned.shape[1], 1)))
-        rows, cols = rows * np.int32(stride), cols * np.int32(stride)
-        flat = rows.astype(np.int64) * grid.sigma.shape[1] + cols
-        xyz, normal = (np.take(x.reshape(-1, 3), flat, axis=0) for x in (grid.xyz, fused.normals[i]))
+    first = 0
+    for i, (grid, marks) in enumerate(zip(fused.grids, fused.marks, strict=True)):
+        at = np.empty((-(-marks.shape[0] // stride), -(-marks.shape[1] // stride)), np.int64)
+        first = number(marks, OWNED, stride, first, at)
+        rows, cols = (a.astype(np.int32) * np.int32(stride) for a in np.nonzero(at >= 0))
+        at = at[at >= 0]
+        xyz, normal = (np.take(x, at, axis=0) for x in (fused.cloud.xyz, fused.cloud.normals))
         camera = rig.cameras[grid.view]
-        reach = np.empty(len(flat), np.float32)
+        reach = np.empty(len(at), np.float32)
         pixel_rad = stride / math.sqrt(camera.lens.K[0, 0] * camera.lens.K[1, 1])
         k.sampling(xyz, normal, geometry.centre(camera.pose), pixel_rad, reach)
-        parts.append((xyz, normal, np.take(grid.sigma, flat), reach, np.full(len(flat), i, np.uint8),
-                      np.take(fused.seen[i], flat), np.stack([cols, rows], axis=1)))
+        parts.append((xyz, normal, np.take(fused.cloud.sigma, at), reach, np.full(len(at), i, np.uint8),
+                      np.take(fused.seen, at), np.stack([cols, rows], axis=1)))
     xyz, normal, sigma, reach, owner, seen, pixel = (np.concatenate(column) for column in zip(*parts, strict=True))
-    field = np.empty((1, len(xyz), 2), np.float64)
-    ks.plane_coordinates(xyz[None], rig.projector.pose.R, rig.projector.pose.t, field)
-    ab = snapped(field[0])
+    q = geometry.transform(rig.projector.pose, xyz)
+    ab = snapped(q[:, :2] / q[:, 2:])
     return _Points(ab, xyz, normal, sigma, reach, owner, seen, pixel, stride).at(along_curve(ab))
 
 

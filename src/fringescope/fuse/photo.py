@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -9,28 +10,50 @@ import numpy as np
 
 from fringescope import geometry
 from fringescope.errors import CaptureError
+from fringescope.kernels import colour as k
+from fringescope.kernels.views import constant
 from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Grid, Photo, PixelFormat, Rig
 
 _RGGB = cv2.COLOR_BayerBG2RGB_EA  # BayerRG of the GenICam names is RGGB, which OpenCV names after its second row
 
+_FEW = 10_000  # places that tell how two pictures differ
 
-def _linear(raw: AnyArray, pixel_format: PixelFormat, camera: str) -> F32:
-    """Raw samples (H, W) or (H, W, 3) to RGB (H, W, 3), 0..1 of full scale."""
+
+def _tables() -> tuple[U8, F32]:
+    """sRGB (IEC 61966-2-1): light k / 4096 to codes (4097,), codes to light (256,)."""
+    light = np.linspace(0.0, 1.0, 4097)
+    curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    code = np.arange(256) / 255.0
+    back = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    return (curve * 255.0 + 0.5).astype(np.uint8), back.astype(np.float32)
+
+
+SRGB, LIGHT = _tables()
+
+
+def _samples(raw: AnyArray, pixel_format: PixelFormat, camera: str) -> AnyArray:
+    """Raw samples (H, W) or (H, W, 3) to codes (H, W, 3), or (H, W, 1) for grey."""
     if pixel_format is PixelFormat.RGB8:
         if raw.ndim != 3 or raw.shape[2] != 3:
             raise CaptureError(f"camera '{camera}': a picture of shape {raw.shape}; RGB8 needs (height, width, 3)")
-        rgb = raw
-    elif raw.ndim != 2:
+        return raw
+    if raw.ndim != 2:
         raise CaptureError(f"camera '{camera}': a picture of shape {raw.shape}; {pixel_format.value} needs one sample "
                            "a pixel, as the sensor gave it")
-    elif pixel_format.is_bayer:
-        if min(raw.shape) < 4:
-            raise CaptureError(f"camera '{camera}': {raw.shape[1]} x {raw.shape[0]} pixels; needed at least 4 x 4")
-        rgb = cv2.cvtColor(np.ascontiguousarray(raw), _RGGB)
-    else:
-        rgb = np.repeat(raw[:, :, None], 3, axis=2)
-    return np.asarray(rgb, dtype=np.float32) / np.float32(pixel_format.max_value)
+    if not pixel_format.is_bayer:
+        return raw[:, :, None]
+    if min(raw.shape) < 4:
+        raise CaptureError(f"camera '{camera}': {raw.shape[1]} x {raw.shape[0]} pixels; needed at least 4 x 4")
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(raw), _RGGB))
+
+
+def _light(samples: AnyArray, pixel_format: PixelFormat, s: FuseSettings) -> F32:
+    """Codes (H, W, 3 or 1) to linear light (H, W, 3), 0..1 of full scale, white-balanced."""
+    white = [s.white_red, 1.0, s.white_blue] if pixel_format.is_colour else [1.0, 1.0, 1.0]
+    out = np.empty((*samples.shape[:2], 3), np.float32)
+    k.scale(constant(samples), (np.array(white) / pixel_format.max_value).astype(np.float32), out)
+    return out
 
 
 def photo(raw: AnyArray, pixel_format: PixelFormat, camera: str, s: FuseSettings | None = None) -> Photo:
@@ -42,14 +65,10 @@ def photo(raw: AnyArray, pixel_format: PixelFormat, camera: str, s: FuseSettings
     if any raw sample that went into it is. Mono gives grey. Raises CaptureError if the shape does not fit the format.
     """
     s = s or FuseSettings()
-    rgb = _linear(raw, pixel_format, camera)
-    full = np.asarray(raw >= pixel_format.max_value)
-    if full.ndim == 3:
-        full = np.asarray(full.any(axis=2))
-    if pixel_format.is_bayer:
-        full = np.asarray(cv2.dilate(full.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-    if pixel_format.is_colour:
-        rgb *= np.array([s.white_red, 1.0, s.white_blue], np.float32)
+    rgb = _light(_samples(raw, pixel_format, camera), pixel_format, s)
+    full = np.empty(raw.shape[:2], np.bool_)
+    k.full(constant(raw if raw.ndim == 3 else raw[:, :, None]), pixel_format.max_value,
+           1 if pixel_format.is_bayer else 0, full)
     return Photo(camera, rgb, full)
 
 
@@ -59,11 +78,10 @@ def photo_from_background(background: F32, pixel_format: PixelFormat, camera: st
 
     It shows the specimen under the projector's light. A Bayer camera's background is a mosaic like its frames.
     """
-    s = s or FuseSettings()
-    share = np.clip(np.nan_to_num(background) / pixel_format.full_scale, 0.0, 1.0)
+    codes, bright = np.empty(background.shape, np.uint16), np.empty(background.shape, np.bool_)
+    k.share_codes(constant(background), np.float32(1.0 / pixel_format.full_scale), np.float32(0.99), codes, bright)
     like = PixelFormat.BAYER_RG16 if pixel_format.is_bayer else PixelFormat.MONO16
-    p = photo((share * 65535.0 + 0.5).astype(np.uint16), like, camera, s)
-    return Photo(camera, p.rgb, np.asarray(share >= 0.99))
+    return Photo(camera, _light(_samples(codes, like, camera), like, s or FuseSettings()), bright)
 
 
 def white_gains(white: Photo, region: Bool | None = None) -> tuple[float, float]:
@@ -82,41 +100,42 @@ def white_gains(white: Photo, region: Bool | None = None) -> tuple[float, float]
 
 
 def is_grey(p: Photo) -> bool:
-    """Whether a picture holds no colour at all."""
-    some = p.rgb[::7, ::7]
+    """Whether a picture holds no colour at all, judged by some of its pixels."""
+    step = 7 * max(1, int(math.sqrt(p.saturated.size / _FEW)))
+    some = p.rgb[::step, ::step]
     return bool((some[..., 0] == some[..., 1]).all() and (some[..., 1] == some[..., 2]).all())
 
 
 def encode_srgb(linear: AnyArray) -> U8:
     """Linear light 0..1 to sRGB codes (IEC 61966-2-1), clipped."""
-    table = np.linspace(0.0, 1.0, 4097)
-    table = np.where(table <= 0.0031308, 12.92 * table, 1.055 * table ** (1 / 2.4) - 0.055)
-    codes = (table * 255.0 + 0.5).astype(np.uint8)
-    return np.asarray(codes[(np.clip(np.nan_to_num(linear), 0.0, 1.0) * 4096.0 + 0.5).astype(np.uint16)])
+    flat = np.ascontiguousarray(linear, np.float32).reshape(-1, 1, 1)
+    out = np.empty((*flat.shape[:2], 3), np.uint8)
+    k.encode(np.broadcast_to(flat, out.shape), np.ones(3, np.float32), SRGB, out)
+    return out[:, 0, 0].reshape(np.shape(linear))
 
 
 def decode_srgb(codes: U8) -> F32:
     """sRGB codes to linear light 0..1."""
-    c = np.arange(256) / 255.0
-    table = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    return table[codes]
+    return LIGHT[codes]
 
 
 def view_gains(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings) -> F64:
     """Factors (V, 3) that make the pictures agree where views overlap; their geometric mean is 1 per channel.
 
-    For each pair of views the mean of the middle half of the log ratios of what both see unsaturated (up to 50,000
+    For each pair of views the mean of the middle half of the log ratios of what both see unsaturated (at some 10,000
     places where their surfaces agree); then least squares over the pairs. Views without overlap keep 1, as do a grey
-    picture's ratios of channels.
+    picture's ratios of channels, and all if `harmonise` is off.
     """
     V = len(grids)
+    if V < 2 or not s.harmonise:
+        return np.ones((V, 3))
     rows: list[F64] = []
     values: list[F64] = []
+    grey = [is_grey(p) for p in photos]
+    near = [4 * _spacing(g) + s.agree_mm for g in grids]
     for a in range(V):
-        ok = grids[a].valid & ~photos[a].saturated
-        where = np.argwhere(ok)
-        where = where[:: max(1, len(where) // 50_000)]
-        p = grids[a].xyz[where[:, 0], where[:, 1]]
+        where = _places(grids[a], photos[a])
+        p = grids[a].xyz[where[0], where[1]]
         for b in range(V):
             if a == b:
                 continue
@@ -126,15 +145,16 @@ def view_gains(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: Fuse
                 inside = (uv > 0).all(axis=1) & (uv[:, 0] < W - 1) & (uv[:, 1] < H - 1)
             j, i = np.rint(uv[inside]).astype(int).T
             q = grids[b].xyz[i, j]
-            near = np.linalg.norm(q - p[inside], axis=1) < 4 * _spacing(grids[b]) + s.agree_mm
-            near &= ~photos[b].saturated[i, j]
-            ca = photos[a].rgb[where[inside][near, 0], where[inside][near, 1]]
-            cb = photos[b].rgb[i[near], j[near]]
+            with np.errstate(invalid="ignore"):
+                same = np.linalg.norm(q - p[inside], axis=1) < near[b]
+            same &= ~photos[b].saturated[i, j]
+            ca = photos[a].rgb[where[0][inside][same], where[1][inside][same]]
+            cb = photos[b].rgb[i[same], j[same]]
             bright = ((ca > 0.01) & (cb > 0.01)).all(axis=1)
             if int(bright.sum()) < 200:
                 continue
             ratio = _middle(np.log(cb[bright] / ca[bright]))
-            if is_grey(photos[a]) or is_grey(photos[b]):
+            if grey[a] or grey[b]:
                 ratio[:] = ratio.mean()
             row = np.zeros(V)
             row[a], row[b] = 1.0, -1.0
@@ -146,6 +166,19 @@ def view_gains(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: Fuse
     return np.asarray(np.exp(np.clip(log_gain, -1.5, 1.5)), dtype=np.float64)
 
 
+def _places(grid: Grid, photo: Photo) -> tuple[AnyArray, AnyArray]:
+    """Rows and columns of unsaturated points, about `_FEW` of a whole picture's, on a lattice."""
+    H, W = grid.sigma.shape
+    step = max(1, int(math.sqrt(H * W / _FEW))) | 1  # odd, so that all samples of a mosaic take part
+    i, j = np.nonzero((grid.reasons[::step, ::step] == 0) & ~photo.saturated[::step, ::step])
+    if len(i) < _FEW // 10 and step > 1:  # a small part of the picture
+        i, j = np.nonzero((grid.reasons == 0) & ~photo.saturated)
+        step = 1
+        thin = max(1, len(i) // _FEW)
+        i, j = i[::thin], j[::thin]
+    return i * step, j * step
+
+
 def _middle(values: F32) -> F64:
     """Mean of the middle half of each column: robust like the median, but not caught on the codes of the camera."""
     v = np.sort(values, axis=0)[len(values) // 4 : len(values) - len(values) // 4]
@@ -153,7 +186,7 @@ def _middle(values: F32) -> F64:
 
 
 def _spacing(grid: Grid) -> float:
-    """Median distance of neighbouring points, mm."""
-    d = np.linalg.norm(np.diff(grid.xyz[::8], axis=1), axis=2)
+    """Median distance of neighbouring points, mm, in some rows."""
+    d = np.linalg.norm(np.diff(grid.xyz[:: max(8, len(grid.xyz) // 32)], axis=1), axis=2)
     d = d[np.isfinite(d)]
     return float(np.median(d)) if len(d) else 0.0

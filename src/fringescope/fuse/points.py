@@ -1,4 +1,7 @@
-"""Organised grids to one cloud: what the views agree on, who owns a place, what colour it has (III-C end, Fig. 12)."""
+"""Organised grids to one cloud: what the views agree on, who owns a place, what colour it has (III-C end, Fig. 12).
+
+Ownership comes first, from the views as they are; then only what is owned is fused, straight into the cloud.
+"""
 
 from __future__ import annotations
 
@@ -11,47 +14,42 @@ import numpy as np
 
 from fringescope import geometry
 from fringescope.errors import EmptyResultError, RigError
-from fringescope.fuse.photo import encode_srgb, is_grey, view_gains
+from fringescope.fuse.owners import Raster, bits_of, drop_doubles, raster_of, settle_owners
+from fringescope.fuse.photo import LIGHT, SRGB, is_grey, view_gains
+from fringescope.kernels import colour as colours
+from fringescope.kernels import fusing, ownership
 from fringescope.kernels import surface as k
+from fringescope.kernels.views import constant
 from fringescope.settings import FuseSettings
-from fringescope.types import F32, F64, U8, AnyArray, Bool, Cloud, Grid, Photo, Rig
+from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, Cloud, Grid, Photo, Rig
 
-_SMOOTH = (15, 15)  # cells over which a view's weight is averaged before ownership is settled
-_GAP = (7, 7)  # pixels around a gap in the blending that tell what blending does there
-_BAND = 256  # rows worked on at a time, which bounds the memory of the sums
+_SAMPLES = 60_000  # pixels of a view that tell its sampling
+_NEAR = 3  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """All views after fusion, still organised. One entry per view, in the order of the grids.
+    """All views after fusion. One entry per view, in the order of the grids.
 
-    `grids` hold the fused points and sigmas on each view's own pixel rays; `owned` (H, W) says which of them make the
-    single layer of the cloud; `seen` (H, W) has bit v set where view number v (in this order) sees the point too;
-    `pictures` (H, W, 3) are sRGB, blended from all views; `spacing_mm` is each view's median sampling on the surface.
+    `cloud` holds the fused points, view by view, row by row: those pixels of each view that make the one layer, on
+    their own rays. `seen` (n,) has bit v set where view number v (in this order) sees the point too. `grids` are the
+    views as they came; `marks` (H, W) have bit 1 where a view owns its pixel. `pictures` (H, W, 3) are sRGB: blended
+    from all views where the view owns the place and 32 pixels around at least, elsewhere the view's own, balanced.
+    `spacing_mm` is each view's median sampling on the surface.
     """
 
+    cloud: Cloud
+    seen: U8
     grids: tuple[Grid, ...]
-    normals: tuple[F32, ...]
+    marks: tuple[U8, ...]
     pictures: tuple[U8, ...]
-    owned: tuple[Bool, ...]
-    seen: tuple[U8, ...]
     spacing_mm: tuple[float, ...]
     gains: F64  #: (V, 3) factors that balance the pictures
 
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One view with what the sums need: weights fall to zero towards borders and highlights."""
-
-    grid: Grid
-    centre: F64
-    normal: F32
-    sigma_n: F32
-    cosine: F32
-    weight: F32
-    rgb: F32
-    colour_weight: F32
-    spacing: float
+    @property
+    def owned(self) -> tuple[Bool, ...]:
+        """Which pixels (H, W) of each view make the single layer of the cloud."""
+        return tuple(np.asarray((m & fusing.OWNED) != 0) for m in self.marks)
 
 
 def _check(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig) -> None:
@@ -67,7 +65,8 @@ def _check(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig) -> None:
         if g.sigma.shape != p.rgb.shape[:2]:
             raise RigError(f"camera '{g.camera}': points on {g.sigma.shape[1]} x {g.sigma.shape[0]} pixels, picture of "
                            f"{p.rgb.shape[1]} x {p.rgb.shape[0]}; needed the same size")
-    if not any(bool(g.valid.any()) for g in grids):
+    bands = (g.reasons[i : i + 256] for g in grids for i in range(0, len(g.reasons), 256))
+    if not any(bool((band == 0).any()) for band in bands):
         raise EmptyResultError("no view has a single valid point: nothing to fuse; see the reasons per view")
 
 
@@ -77,10 +76,27 @@ def normals(grid: Grid, rig: Rig, s: FuseSettings | None = None) -> F32:
     Regression of the points in a window of `normal_radius` on their pixel coordinates, not across jumps.
     """
     s = s or FuseSettings()
-    out = np.empty_like(grid.xyz)
-    k.normals(grid.xyz, grid.sigma, geometry.centre(rig.cameras[grid.view].pose), s.normal_radius, s.max_slope,
-              s.jump_sigma, out)
+    camera = rig.cameras[grid.view]
+    out = np.empty(grid.xyz.shape, np.float32)
+    k.normals(*_points(grid), geometry.centre(camera.pose), _angle(camera), s.normal_radius, s.max_slope, s.jump_sigma,
+              out)
     return out
+
+
+def _points(grid: Grid) -> tuple[F32, F32, F32]:
+    """xyz (H, W, 3), the same as rows (H, 3 W), sigma: as kernels take them."""
+    xyz, sigma = constant(grid.xyz), constant(grid.sigma)
+    return xyz, xyz.reshape(len(xyz), -1), sigma
+
+
+def _angle(camera: Camera) -> float:
+    """Least angle between the rays of neighbouring pixels, radians."""
+    L = camera.lens
+    v, u = np.meshgrid(np.linspace(0, L.height - 1, 9), np.linspace(0, L.width - 1, 9), indexing="ij")
+    uv = np.stack([u, v], -1)
+    ray = [geometry.world_rays(camera, uv + step)[1] for step in ([0, 0], [1, 0], [0, 1], [1, 1], [1, -1])]
+    least = float(np.min([np.linalg.norm(r - ray[0], axis=-1) for r in ray[1:]]))
+    return least if math.isfinite(least) else 0.0
 
 
 def _close(mask: Bool, reach: float) -> Bool:
@@ -100,200 +116,121 @@ def _rise(mask: Bool, width: float) -> F32:
     return np.asarray(x * x * (3 - 2 * x), dtype=np.float32)
 
 
-def _view(grid: Grid, photo: Photo, gain: F64, colourless: bool, rig: Rig, s: FuseSettings) -> _View:
-    """Weights of one view: cosine of incidence / sigma^2 along the normal, times its rise from borders and jumps."""
-    centre = geometry.centre(rig.cameras[grid.view].pose)
-    n = normals(grid, rig, s)
-    cosine, step = np.empty_like(grid.sigma), np.empty_like(grid.sigma)
-    k.incidence(grid.xyz, n, centre, cosine)
-    k.spacing(grid.xyz, step)
-    found = step[np.isfinite(step)]
-    spacing = float(np.median(found)) if len(found) else 0.0
-    valid = np.isfinite(grid.xyz[..., 0])
-    whole = _close(valid, max(1.0, 0.5 * s.hole_mm / spacing) if spacing > 0 else 1.0)
-    jump = np.empty(valid.shape, np.bool_)
-    k.jumps(grid.xyz, grid.sigma, centre, s.max_slope, s.jump_sigma, jump)
-    whole &= ~jump
-    rise = _rise(whole, s.blend_mm / spacing if spacing > 0 else 1.0)
+def _spacing(grid: Grid) -> float:
+    """Median sampling of a view on the surface, mm, from some of its pixels; 0 without neighbours."""
+    H, W = grid.sigma.shape
+    step = max(1, int(math.sqrt(H * W / _SAMPLES)))
+    out: F32 = np.empty((-(-H // step), -(-W // step)), np.float32)
+    k.spacing(constant(grid.xyz), step, out)
+    found = out[np.isfinite(out)]
+    return float(np.median(found)) if len(found) else 0.0
+
+
+def _side(grid: Grid, photo: Photo, gain: F64, share: float, spacing: float, raster: Raster, there: U8, rig: Rig,
+          s: FuseSettings) -> fusing.Side:
+    """One view as the sums need it: normals, and how weights rise from its borders and jumps."""
+    camera = rig.cameras[grid.view]
+    H, W = grid.sigma.shape
+    hole = max(1.0, 0.5 * s.hole_mm / spacing) if spacing > 0 else 1.0
+    width = s.blend_mm / spacing if spacing > 0 else 1.0
+    step = max(1, int(min(0.5 * hole, width / 20)))  # what rises over hundreds of pixels needs no value in each
+    squares, code = np.zeros((-(-H // step), -(-W // step)), np.uint8), np.empty((H, 2 * W), np.int16)
+    centre = geometry.centre(camera.pose)
+    k.survey(*_points(grid), centre, _angle(camera), s.normal_radius, s.max_slope, s.jump_sigma, squares, step,
+             raster.vector, code, there)
+    whole = _close((squares & k.SOME) != 0, hole / step) & ((squares & k.TORN) == 0)
+    rise = np.empty((H, W), np.uint8)
+    colours.spread(rise, np.pad(_rise(whole, width / step), 1, mode="edge"), step)
+    clear = np.zeros(1, np.uint8)
+    if photo.saturated.any():
+        clear = np.empty((H, W), np.uint8)
+        colours.clearness(constant(photo.saturated), s.highlight_pixels, clear)
+    return fusing.Side(
+        constant(grid.xyz).reshape(-1), constant(grid.sigma).reshape(-1), constant(code).reshape(-1),
+        constant(rise).reshape(-1), constant(photo.rgb).reshape(-1), gain.astype(np.float32),
+        constant(clear).reshape(-1), np.float32(share),
+        centre.astype(np.float32), H, W, geometry.pose_vector(camera.pose), geometry.lens_vector(camera.lens),
+    )
+
+
+def _limits(s: FuseSettings) -> fusing.Limits:
     low, high = np.cos(np.radians([s.grazing_deg, s.oblique_deg]))
-    front = np.clip((cosine - low) / max(high - low, 1e-6), 0.0, 1.0)
-    rise = np.maximum(rise, 1e-3) * front * front * (3 - 2 * front)
-    with np.errstate(invalid="ignore"):
-        sigma_n = grid.sigma * np.maximum(cosine, 0.05)
-        weight = np.where(valid, rise * cosine / np.maximum(sigma_n, 1e-6) ** 2, 0.0)
-    clear = _rise(~photo.saturated, s.highlight_pixels) if photo.saturated.any() else np.ones_like(rise)
-    colour_weight = np.where(valid, rise * clear * cosine**2, 0.0)
-    if colourless:
-        colour_weight *= 1e-6
-    rgb = photo.rgb * gain.astype(np.float32)
-    return _View(grid, centre, n, sigma_n.astype(np.float32), cosine, weight.astype(np.float32), rgb,
-                 colour_weight.astype(np.float32), spacing)
+    numbers = (s.agree_sigma, s.agree_mm, low, 1.0 / max(high - low, 1e-6), s.gloss)
+    return fusing.Limits(*(np.float32(x) for x in numbers))
 
 
-def _views(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings) -> tuple[list[_View], F64]:
-    gains = view_gains(grids, photos, rig, s) if s.harmonise and len(grids) > 1 else np.ones((len(grids), 3))
-    grey = [is_grey(p) for p in photos]
-    colourless = [g and not all(grey) for g in grey]
-    return [_view(g, p, gains[i], colourless[i], rig, s)
-            for i, (g, p) in enumerate(zip(grids, photos, strict=True))], gains
+def _starts(counts: Sequence[AnyArray]) -> list[AnyArray]:
+    """Where the rows of each view begin (H + 1,) if all views' rows follow each other."""
+    out, first = [], 0
+    for c in counts:
+        out.append(np.concatenate([[first], first + np.cumsum(c)]).astype(np.int64))
+        first += int(c.sum())
+    return out
+
+
+def _room(n: int) -> tuple[F32, F32, F32]:
+    return np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32)
 
 
 def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings | None = None) -> Fused:
-    """All views in one frame: on every pixel ray the mean of the views that see the place, weighted by sigma and angle.
+    """All views to one layer: on every owned pixel's ray the mean of the views that see the place.
 
-    Each view contributes one sample, not an interpolation of several, so that fusion averages over views and never over
-    neighbours. A view's weight rises from nothing at its border, so that no step appears there. Views that disagree by
-    more than their sigmas explain do not see the same place. `photos` has one picture per grid, in the same order.
-    Raises RigError for views that the rig lacks, or of other sizes, EmptyResultError if no view has a valid point.
+    Weighted by sigma and angle. Each view contributes one sample, not an interpolation of several, so that fusion
+    averages over views and never over neighbours. A view's weight rises from nothing at its border, so that no step
+    appears there. Views that disagree by more than their sigmas explain do not see the same place. Pixels that their
+    view does not own are not fused. `photos` has one picture per grid, in the same order. Raises RigError for views
+    that the rig lacks, or of other sizes, EmptyResultError if no view has a valid point.
     """
     s = s or FuseSettings()
     _check(grids, photos, rig)
-    views, gains = _views(grids, photos, rig, s)
-    V = len(views)
-    lenses = [geometry.lens_vector(rig.cameras[v.grid.view].lens) for v in views]
-    poses = [rig.cameras[v.grid.view].pose for v in views]
-    fused, ns, pictures, seen_all = [], [], [], []
-    for a, v in enumerate(views):
-        H, W = v.grid.sigma.shape
-        xyz, n, sigma = np.empty_like(v.grid.xyz), np.empty_like(v.grid.xyz), np.empty_like(v.grid.sigma)
-        colour, seen = np.empty_like(v.rgb), np.zeros((H, W), np.uint8)
-        for row0 in range(0, H, _BAND):
-            row1 = min(row0 + _BAND, H)
-            shift, total, variance = (np.zeros((row1 - row0, W), np.float64) for _ in range(3))
-            facing = np.zeros((row1 - row0, W, 3), np.float64)
-            samples = np.zeros((max(V - 1, 1), row1 - row0, W, 4), np.float32)
-            others = [b for b in range(V) if b != a]
-            for slot, b in enumerate(others):
-                w = views[b]
-                k.gather(v.grid.xyz, v.normal, v.sigma_n, v.centre, row0, row1, poses[b].R, poses[b].t, lenses[b],
-                         w.grid.xyz, w.normal, w.sigma_n, w.cosine, w.weight, w.rgb, w.colour_weight, s.agree_sigma,
-                         s.agree_mm, np.uint8(1 << b), shift, total, variance, facing, seen[row0:row1], samples[slot])
-            k.settle(v.grid.xyz, v.normal, v.sigma_n, v.weight, v.centre, row0, row1, shift, total, variance, facing,
-                     xyz, n, sigma)
-            k.blend(samples, s.gloss, row0, v.rgb, v.colour_weight, colour)
-        _even(colour, v.rgb, seen != 0)
-        seen[np.isfinite(v.sigma_n)] |= np.uint8(1 << a)
-        fused.append(Grid(v.grid.view, v.grid.camera, xyz, sigma, v.grid.reasons))
-        ns.append(n)
-        pictures.append(encode_srgb(colour))
-        seen_all.append(seen)
-    own = _ownership(fused, ns, [v.weight for v in views], [v.spacing for v in views], rig, s)
-    return Fused(tuple(fused), tuple(ns), tuple(pictures), tuple(own), tuple(seen_all),
-                 tuple(v.spacing for v in views), gains)
-
-
-def _even(colour: F32, own: F32, blended: Bool) -> None:
-    """Carry what blending did to a picture into its gaps: pixels where no other view sees the place, but around which
-    others do, as single pixels without a point in a highlight. They get their own colour times the ratio of blended to
-    own colour around them.
-    """
-    if blended.all() or not blended.any():
-        return
-    there = blended.astype(np.float32)
-    share = cv2.blur(there, _GAP)
-    after, before = (cv2.blur(c * there[..., None], _GAP) for c in (colour, own))
-    gap = ~blended & (share > 0.3)
-    colour[gap] = own[gap] * np.clip(after[gap] / np.maximum(before[gap], 1e-6), 0.0, 4.0)
-
-
-def _ownership(grids: Sequence[Grid], ns: Sequence[F32], weights: Sequence[F32], spacings: Sequence[float], rig: Rig,
-               s: FuseSettings) -> list[Bool]:
-    """Which points make the one layer.
-
-    Every point is lit by the projector, so the surface is single-valued over the projector's field: cells of it, about
-    two samples wide, each belong to the view with the largest smoothed weight among those with a point there.
-    Points of different views nearer than the separation across a border of cells are doubles; one of them goes.
-    """
-    valid = [np.isfinite(g.xyz[..., 0]) for g in grids]
-    if len(grids) == 1:
-        return valid
-    pose = rig.projector.pose
-    coordinates = []
-    depth = np.inf
-    for g in grids:
-        ab = np.empty((*g.sigma.shape, 2), np.float64)
-        k.plane_coordinates(g.xyz, pose.R, pose.t, ab)
-        coordinates.append(ab)
-        some = g.xyz[::8, ::8].reshape(-1, 3)
-        some = some[np.isfinite(some[:, 0])]
-        if len(some):
-            depth = min(depth, float(np.median(geometry.transform(pose, some)[:, 2])))
-    spacing = max(x for x, ok in zip(spacings, valid, strict=True) if ok.any())
-    separation = max(s.separation_mm, 0.5 * spacing) / depth
-    cell = max(2.0 * spacing / depth, 1.01 * separation)
-    with np.errstate(invalid="ignore"):
-        filled = [ab.reshape(-1, 2) for ab, ok in zip(coordinates, valid, strict=True) if ok.any()]
-        low = np.min([np.nanmin(ab, axis=0) for ab in filled], axis=0)
-        high = np.max([np.nanmax(ab, axis=0) for ab in filled], axis=0)
-    cols, rows = (np.floor((high - low) / cell).astype(int) + 1).tolist()
-    best, owner = np.zeros((rows, cols), np.float32), np.full((rows, cols), -1, np.int16)
-    for i, (ab, w) in enumerate(zip(coordinates, weights, strict=True)):
-        total, count = np.zeros((rows, cols)), np.zeros((rows, cols), np.int32)
-        k.bin_weights(ab, w, low, cell, total, count)
-        smooth = cv2.blur(total, _SMOOTH) / np.maximum(cv2.blur(count.astype(np.float64), _SMOOTH), 1e-9)
-        score = np.where(count > 0, smooth + 1e-12, 0.0).astype(np.float32)
-        better = score > best
-        best[better], owner[better] = score[better], i
-    own = []
-    for i, ab in enumerate(coordinates):
-        mine = np.empty(ab.shape[:2], np.bool_)
-        k.owned(ab, low, cell, owner, i, mine)
-        own.append(mine)
-    _drop_doubles(grids, ns, coordinates, own, owner, low, cell, separation, 1.05 * s.separation_mm, 3 * cell * depth)
-    return own
-
-
-def _drop_doubles(grids: Sequence[Grid], ns: Sequence[F32], coordinates: Sequence[F64], own: Sequence[Bool],
-                  owner: AnyArray, low: F64, cell: float, separation: float, sideways: float, near: float) -> None:
-    """Clear from `own` the points that lie within the separation of another view's point."""
-    lowest = cv2.erode(owner, np.ones((3, 3), np.uint8))
-    edge = (cv2.dilate(owner, np.ones((3, 3), np.uint8)) != lowest) & (owner >= 0)
-    where, ab, cells, views, xyz, normal = [], [], [], [], [], []
-    for i, mine in enumerate(own):
-        at = np.argwhere(mine)
-        p = coordinates[i][mine]
-        c = ((p - low) / cell).astype(np.int64)
-        close = edge[c[:, 1], c[:, 0]]
-        at = at[close]
-        where.append(at)
-        xyz.append(grids[i].xyz[at[:, 0], at[:, 1]])
-        normal.append(ns[i][at[:, 0], at[:, 1]])
-        ab.append(p[close])
-        cells.append(c[close, 1] * owner.shape[1] + c[close, 0])
-        views.append(np.full(int(close.sum()), i, np.int16))
-    index, points, view = np.concatenate(cells), np.concatenate(ab), np.concatenate(views)
-    if not len(index):
-        return
-    order = np.argsort(index, kind="stable")
-    unique, start = np.unique(index[order], return_index=True)
-    lookup = np.full(owner.shape, -1, np.int64)
-    lookup.ravel()[unique] = np.arange(len(unique))
-    out = np.zeros(len(order), np.bool_)
-    k.doubles(points[order], np.concatenate(xyz)[order], np.concatenate(normal)[order], view[order], separation,
-              sideways, near, np.append(start, len(order)),
-              unique // owner.shape[1], unique % owner.shape[1], lookup, out)
-    gone = np.zeros(len(order), np.bool_)
-    gone[order[out]] = True
-    first = 0
-    for i, at in enumerate(where):
-        g = gone[first : first + len(at)]
-        own[i][at[g, 0], at[g, 1]] = False
-        first += len(at)
-
-
-def _stack(grids: Sequence[Grid], ns: Sequence[F32], pictures: Sequence[U8], masks: Sequence[Bool]) -> Cloud:
-    return Cloud(
-        np.concatenate([g.xyz[m] for g, m in zip(grids, masks, strict=True)]),
-        np.concatenate([n[m] for n, m in zip(ns, masks, strict=True)]),
-        np.concatenate([p[m] for p, m in zip(pictures, masks, strict=True)]),
-        np.concatenate([g.sigma[m] for g, m in zip(grids, masks, strict=True)]),
-        np.concatenate([np.full(int(m.sum()), g.view, np.uint8) for g, m in zip(grids, masks, strict=True)]),
-    )
+    V, limits = len(grids), _limits(s)
+    gains = view_gains(grids, photos, rig, s)
+    grey = [is_grey(p) for p in photos]
+    spacings = [_spacing(g) for g in grids]
+    raster = raster_of(grids, spacings, rig, s)
+    there: U8 = np.zeros((V, *raster.shape), np.uint8)
+    sides = [_side(g, p, gains[i], 1e-6 if grey[i] and not all(grey) else 1.0, spacings[i], raster, there[i], rig, s)
+             for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
+    owner = settle_owners(sides, limits, raster, there)
+    del there
+    filled = tuple(sides)
+    marks = [np.empty(g.sigma.shape, np.uint8) for g in grids]
+    squares = [tuple(-(-n // fusing.TILE) for n in g.reasons.shape) for g in grids]
+    near = [np.zeros(shape, np.uint8) for shape in squares]
+    owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))
+    for i, g in enumerate(grids):
+        ownership.mark(_points(g)[1], raster.vector, owner, bits_of(i), fusing.TILE, marks[i], owned[i], close[i],
+                       near[i])
+    no_picture, nothing = np.empty((0, 0, 3), np.uint8), np.empty((0, 3), np.uint8)
+    starts = _starts(close)
+    xyz, normal, sigma = _room(int(starts[-1][-1]))
+    for i in range(V):
+        fusing.fuse(filled, V, i, limits, marks[i], fusing.EDGE, near[i], starts[i], SRGB, xyz, normal, sigma, nothing,
+                    nothing[:, 0], no_picture)
+    views = np.repeat(np.arange(V, dtype=np.int16), [int(c.sum()) for c in close])
+    gone = drop_doubles(xyz, normal, views, raster, s)
+    for i in range(V):
+        ownership.unmark(marks[i], fusing.EDGE, starts[i], gone)
+        ownership.count_marked(marks[i], fusing.OWNED, owned[i])
+    starts = _starts(owned)
+    n = int(starts[-1][-1])
+    xyz, normal, sigma = _room(n)
+    rgb, seen = np.empty((n, 3), np.uint8), np.empty(n, np.uint8)
+    pictures = [np.empty((*m.shape, 3), np.uint8) for m in marks]
+    for i in range(V):
+        around = cv2.dilate(near[i], np.ones((_NEAR, _NEAR), np.uint8))
+        fusing.fuse(filled, V, i, limits, marks[i], fusing.OWNED, around, starts[i], SRGB, xyz, normal, sigma, rgb,
+                    seen, pictures[i])
+        colours.fill_gaps(marks[i], fusing.BLENDED, around, fusing.TILE, sides[i].rgb, sides[i].gain, SRGB, LIGHT,
+                         pictures[i])
+    view = np.repeat(np.array([g.view for g in grids], np.uint8), [int(c.sum()) for c in owned])
+    return Fused(Cloud(xyz, normal, rgb, sigma, view), seen, tuple(grids), tuple(marks), tuple(pictures),
+                 tuple(spacings), gains)
 
 
 def cloud(fused: Fused) -> Cloud:
     """The default cloud: one layer, each place by the view that owns it, with the combined sigma along its ray."""
-    return _stack(fused.grids, fused.normals, fused.pictures, fused.owned)
+    return fused.cloud
 
 
 def all_points(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings | None = None) -> Cloud:
@@ -303,13 +240,23 @@ def all_points(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: Fuse
     """
     s = s or FuseSettings()
     _check(grids, photos, rig)
-    gains = view_gains(grids, photos, rig, s) if s.harmonise and len(grids) > 1 else np.ones((len(grids), 3))
-    masks = [np.asarray(np.isfinite(g.xyz[..., 0])) for g in grids]
-    pictures = [encode_srgb(p.rgb * g.astype(np.float32)) for p, g in zip(photos, gains, strict=True)]
-    return _stack(grids, [normals(g, rig, s) for g in grids], pictures, masks)
+    gains = view_gains(grids, photos, rig, s)
+    counts = []
+    for g in grids:
+        counts.append(np.empty(len(g.sigma), np.int64))
+        colours.count_points(_points(g)[1], counts[-1])
+    starts = _starts(counts)
+    n = int(starts[-1][-1])
+    xyz, normal, sigma = _room(n)
+    rgb = np.empty((n, 3), np.uint8)
+    for i, (g, p) in enumerate(zip(grids, photos, strict=True)):
+        colours.pack(constant(g.xyz), constant(g.sigma), normals(g, rig, s), constant(p.rgb),
+                     gains[i].astype(np.float32), SRGB, starts[i], xyz, normal, sigma, rgb)
+    view = np.repeat(np.array([g.view for g in grids], np.uint8), [int(c.sum()) for c in counts])
+    return Cloud(xyz, normal, rgb, sigma, view)
 
 
 def median_spacing(fused: Fused) -> float:
     """Median sampling, mm, of the views that own something."""
-    own = [x for x, o in zip(fused.spacing_mm, fused.owned, strict=True) if o.any()]
+    own = [x for x, m in zip(fused.spacing_mm, fused.marks, strict=True) if (m & fusing.OWNED).any()]
     return float(np.median(own)) if own else math.nan

@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from fringescope.kernels.domains import label_of
-from fringescope.kernels.lens import to_plane
 from fringescope.kernels.links import largest_step, linked, spread
 from fringescope.kernels.tiles import TILE
 from fringescope.threads import by_rows
@@ -283,56 +282,3 @@ def mark_off_surface(first, last, phase, sigma, node, label, kind, asked, radius
                     measures[0, i, j], measures[1, i, j] = distance, roughness
                 if not (distance <= far and roughness <= rough):
                     reasons[i, j] = bit
-
-
-@by_rows(lambda _xyz, sigma, *_: sigma.shape[0])
-def cross_examine(first, last, xyz, sigma, other, other_sigma, R, t, lens, tolerance, slack, confirmed, denied):
-    """Compare a view's points (H, W, 3) with the surface that another camera (pose R, t) sees through its pixels.
-
-    The other surface is interpolated between four pixels that all carry points. Nearer than `tolerance` combined sigmas
-    plus `slack` pixel footprints plus the rise among the four: confirmed (counted). In front of it by more: denied.
-    Behind it: hidden there, no evidence. Depths are along the other camera's axis.
-    """
-    _H, W = sigma.shape
-    h, w = other_sigma.shape
-    for i in range(first, last):
-        for j in range(W):
-            X = xyz[i, j, 0]
-            if X != X:
-                continue
-            Y = xyz[i, j, 1]
-            Z = xyz[i, j, 2]
-            x = R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0]
-            y = R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1]
-            z = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
-            if not z > 0.0:
-                continue
-            u, v = to_plane(x / z, y / z, lens)
-            if not (0.0 <= u < w - 1 and 0.0 <= v < h - 1):
-                continue
-            a = int(v)
-            b = int(u)
-            fy = v - a
-            fx = u - b
-            depth = 0.0
-            low = np.inf
-            high = -np.inf
-            noise = 0.0
-            for di in range(2):
-                for dj in range(2):
-                    p0 = other[a + di, b + dj, 0]
-                    p1 = other[a + di, b + dj, 1]
-                    p2 = other[a + di, b + dj, 2]
-                    d = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2 + t[2]
-                    weight = (fy if di == 1 else 1.0 - fy) * (fx if dj == 1 else 1.0 - fx)
-                    depth += weight * d
-                    low = min(low, d)
-                    high = max(high, d)
-                    noise = max(noise, other_sigma[a + di, b + dj])
-            if depth != depth:
-                continue
-            limit = tolerance * math.sqrt(sigma[i, j] ** 2 + noise * noise) + slack * z / lens[0] + (high - low)
-            if z < depth - limit:
-                denied[i, j] += 1
-            elif z <= depth + limit:
-                confirmed[i, j] += 1

@@ -319,7 +319,7 @@ def scan(
     grids, photos = [grids[i] for i in order], [photos[i] for i in order]
     tell("comparing the views", 0.7)
     start = perf_counter()
-    grids = list(denoise.agree(grids, rig, s.denoise))
+    grids = list(denoise.agree(grids, rig, s.denoise, in_place=True))
     verdicts = [denoise.verdict(g, figures["views"][g.camera]["interpolated"]) for g in grids]
     verdicts = [replace(v, words=(*v.words, *notes[v.camera])) for v in verdicts]
     if not any(v.points for v in verdicts):
