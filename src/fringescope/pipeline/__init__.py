@@ -279,7 +279,7 @@ def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:
     plan = view.plan
     if view.color is None:
         return fuse.photo_from_background(decoded.background, plan.pixel_format, plan.camera, s.fuse)
-    return fuse.photo(view.color, plan.pixel_format, plan.camera, s.fuse)
+    return fuse.photo(phase.unpacked(view.color, plan.pixel_format), plan.pixel_format, plan.camera, s.fuse)
 
 
 def scan(
