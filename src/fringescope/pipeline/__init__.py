@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, response, triangulate
-from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
+from fringescope import calibrate, denoise, evaluate, fuse, geometry, memory, phase, response, triangulate
+from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, ResourceError, UsageError
 from fringescope.pipeline import fast
 from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
@@ -299,6 +299,7 @@ def scan(
     see `scan_view`. Raises EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
+    _check_memory(views, rig)
     tell = progress or _silent
     times: dict[str, float] = {}
     grids: list[Grid] = []
@@ -346,6 +347,27 @@ def scan(
     return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, coarse, every)
 
 
+VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud
+
+
+def _check_memory(views: Sequence[ViewInput], rig: Rig) -> None:
+    """Raise ResourceError if the machine has too little memory left for a scan of these views."""
+    free = memory.available()
+    if free is None or not views:
+        return
+    lenses = [rig.camera(v.plan.camera).lens for v in views]
+    pixels = [lens.width * lens.height for lens in lenses]
+    unread = [0 if isinstance(v.frames, list | tuple) else len(v.plan.keys) * v.plan.pixel_format.dtype.itemsize
+              for v in views]  # fmt: skip
+    need = max(n * (VIEW_BYTES + u) for n, u in zip(pixels, unread, strict=True))
+    need += sum(pixels) * (KEPT_BYTES + CLOUD_BYTES)
+    if need > free:
+        raise ResourceError(
+            f"{len(views)} views, {sum(pixels) / 1e6:.1f} megapixels in all, need about {need / 1e9:.1f} GB of memory; "
+            f"{free / 1e9:.1f} GB are free: close other programs, or scan fewer views or smaller pictures at a time"
+        )
+
+
 def _silent(_what: str, _share: float) -> None:
     """No progress is shown."""
 
@@ -358,6 +380,7 @@ def _figures(view: ViewInput, decoded: Decoded, grid: Grid) -> dict[str, Any]:
     sigma, A, B = (a[cut][ok] for a in (grid.sigma, decoded.background, decoded.modulation))
     r = view.response
     return {
+        "way": "staged" if decoded.sets or decoded.gray else "fused",
         "response": None if r is None else {"gamma": r.gamma, "needed": r.needed},
         "noise": {"a": decoded.noise.a, "b": decoded.noise.b, "source": decoded.noise.source},
         "sigma_median_mm": float(np.median(sigma)) if ok.any() else None,
