@@ -1,12 +1,13 @@
 """The recipes: which step comes next. Objects in, objects out; reads like Figs. 6 and 7 of the paper.
 
 Two doors: `scan` does the usual thing in one call; `scan_view`, `decode_view` and the stages that they name are the
-parts it is made of.
+parts it is made of. `preview` is what can be shown first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -15,9 +16,10 @@ import numpy as np
 
 from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, response, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
-from fringescope.pipeline import fast
+from fringescope.pipeline import coarse, fast
 from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
+from fringescope.threads import WORKERS
 from fringescope.types import (
     F32,
     U16,
@@ -280,6 +282,29 @@ def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:
     if view.color is None:
         return fuse.photo_from_background(decoded.background, plan.pixel_format, plan.camera, s.fuse)
     return fuse.photo(view.color, plan.pixel_format, plan.camera, s.fuse)
+
+
+def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = None) -> Surface:
+    """The coarse surface, to be shown before the fine one is made: the same steps on thinned frames.
+
+    About 200,000 pixels of each view take part, see `coarse.thinned`; the textures are as coarse. Vertices are points of
+    the specimen as exact as any. `frames` must be sequences. Raises EmptyResultError, with the reasons, if no view keeps
+    a point or no triangle is left; and as `scan_view`.
+    """
+    s = settings or Settings()
+    few, thin = coarse.thinned(views, rig)
+
+    def one(view: ViewInput) -> tuple[Grid, Photo, tuple[str, ...]]:
+        decoded, grid = scan_view(view, thin, s)
+        return grid, picture(view, decoded, s), decoded.notes
+
+    with ThreadPoolExecutor(WORKERS) as pool:  # small pictures leave cores idle
+        made = sorted(pool.map(one, few), key=lambda m: m[0].view)
+    grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
+    if not any(g.valid.any() for g in grids):
+        words = [w for g, (_, _, notes) in zip(grids, made, strict=True) for w in (*denoise.verdict(g, 0).words[1:], *notes)]
+        raise EmptyResultError("no point was left; " + "; ".join(words))
+    return fuse.preview(fuse.merge(grids, [photo for _, photo, _ in made], thin, s.fuse), thin, s.mesh)
 
 
 def scan(
