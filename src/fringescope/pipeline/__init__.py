@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fringescope import calibrate, denoise, evaluate, fuse, geometry, phase, response, triangulate
+from fringescope import denoise, fuse, geometry, phase, response, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
 from fringescope.pipeline import coarse, fast
 from fringescope.pipeline.fast import Device
@@ -41,6 +41,9 @@ from fringescope.types import (
     ViewInput,
     ViewPlan,
 )
+
+if TYPE_CHECKING:  # they import much of SciPy, which a scan can do without: only the recipes that need them load them
+    from fringescope import calibrate, evaluate
 
 Progress = Callable[[str, float], None]  #: called with what is being done and the share that is done, 0 to 1
 
@@ -129,6 +132,8 @@ def see_board(view: ViewInput, board: Board, pose: str, s: Settings) -> tuple[Si
     Frames are decoded band by band: where `view.frames` can give rows (`RowFrames`), memory does not grow with their
     number. Raises CaptureError or DecodeError for frames that do not fit.
     """
+    from fringescope import calibrate
+
     decoded, mean = decode_bands(view, s)
     try:
         return calibrate.see(decoded, mean, view.plan, board, pose, s.board), mean, ""
@@ -193,6 +198,8 @@ def calibrate_rig(
 
     Raises CalibrationError, with what to photograph, where they do not make a rig.
     """
+    from fringescope import calibrate
+
     tell = progress or _silent
     poses: dict[str, list[Sighting]] = {}
     for one in sightings:
@@ -225,6 +232,8 @@ def verify(
 
     `must_see_board`: no board found is an error, not a doubt. Raises as `scan_view`, and CalibrationError.
     """
+    from fringescope import calibrate, evaluate
+
     tell = progress or _silent
     grids: list[Grid] = []
     sightings: list[Sighting] = []
@@ -287,12 +296,12 @@ def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:
 def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = None) -> Surface:
     """The coarse surface, to be shown before the fine one is made: the same steps on thinned frames.
 
-    About 200,000 pixels of each view take part, see `coarse.thinned`; the textures are as coarse. Vertices are points of
-    the specimen as exact as any. `frames` must be sequences. Raises EmptyResultError, with the reasons, if no view keeps
-    a point or no triangle is left; and as `scan_view`.
+    About `mesh.preview_pixels` of each view take part, see `coarse.thinned`; the textures are as coarse, the vertices
+    as exact as any point. Raises EmptyResultError, with the reasons, if no view keeps a point or no triangle is left;
+    and as `scan_view`.
     """
     s = settings or Settings()
-    few, thin = coarse.thinned(views, rig)
+    few, thin = coarse.thinned(views, rig, s.mesh.preview_pixels)
 
     def one(view: ViewInput) -> tuple[Grid, Photo, tuple[str, ...]]:
         decoded, grid = scan_view(view, thin, s)
@@ -302,7 +311,8 @@ def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = No
         made = sorted(pool.map(one, few), key=lambda m: m[0].view)
     grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
     if not any(g.valid.any() for g in grids):
-        words = [w for g, (_, _, notes) in zip(grids, made, strict=True) for w in (*denoise.verdict(g, 0).words[1:], *notes)]
+        words = [w for g in grids for w in denoise.verdict(g).words[1:]]
+        words += [f"{g.camera}: {note}" for g, _, notes in made for note in notes]
         raise EmptyResultError("no point was left; " + "; ".join(words))
     return fuse.preview(fuse.merge(grids, [photo for _, photo, _ in made], thin, s.fuse), thin, s.mesh)
 
@@ -316,12 +326,15 @@ def scan(
     surface: bool = True,
     device: Device = "cpu",
     progress: Progress | None = None,
+    first: Callable[[Surface], None] | None = None,
 ) -> Scan:
     """Fringe images of all views to one clean, coloured surface.
 
     `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Where the
     points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. `device`:
-    see `scan_view`. Raises EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
+    see `scan_view`. `first` is called with the coarse surface of `preview` before the fine work begins, and not called
+    where there is none; then all views' frames are held in memory. Raises EmptyResultError, with the reasons, if no
+    view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
     tell = progress or _silent
@@ -330,6 +343,14 @@ def scan(
     photos: list[Photo] = []
     notes: dict[str, tuple[str, ...]] = {}
     figures: dict[str, Any] = {"views": {}}
+    if first is not None:
+        tell("coarse surface", 0.0)
+        start = perf_counter()
+        views = [replace(view, frames=list(view.frames)) for view in views]
+        coarsest = _preview_if_any(views, rig, s)
+        times["preview"] = perf_counter() - start
+        if coarsest is not None:
+            first(coarsest)
     for n, view in enumerate(views):
         tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
         start = perf_counter()
@@ -369,6 +390,13 @@ def scan(
     figures["times_s"] = times
     fine, coarse = (levels[0], levels[-1]) if levels else (None, None)
     return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, coarse, every)
+
+
+def _preview_if_any(views: Sequence[ViewInput], rig: Rig, s: Settings) -> Surface | None:
+    try:
+        return preview(views, rig, s)
+    except EmptyResultError:  # the fine scan may still keep points, or says why not
+        return None
 
 
 def _silent(_what: str, _share: float) -> None:

@@ -12,46 +12,49 @@ import numpy as np
 
 from fringescope.errors import CaptureError
 from fringescope.threads import WORKERS
-from fringescope.types import AnyArray, Camera, Lens, Rig, ViewInput
-
-PIXELS = 200_000  #: of a view that are about left
-BAND = 64  #: thinned rows that are copied at a time
+from fringescope.types import AnyArray, Camera, FrameKey, Lens, Rig, ViewInput
 
 
-def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int = PIXELS) -> tuple[tuple[ViewInput, ...], Rig]:
+def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[ViewInput, ...], Rig]:
     """The views with every n-th row and column alone, and the rig whose cameras have such pixels.
 
-    n is odd, so that every colour of a mosaic comes in, and leaves about `pixels` of each view (from a third to three
-    times as many; a picture of fewer stays whole). Frames must be sequences; they are copied, the rows that are left
-    out are not read. Raises CaptureError for a view without frames, RigError if the rig lacks a camera.
+    n is odd, so that every colour of a mosaic comes in, and leaves about `pixels` of each view: from a third to three
+    times as many, fewer only where a view has fewer. A view of another size than the rig's stays whole, for the stages
+    to refuse. Frames are read one by one; rows that are left out are not touched. Raises CaptureError for a view
+    without frames, RigError if the rig lacks a camera.
     """
-    strides, made = [1] * len(rig.cameras), []
     with ThreadPoolExecutor(WORKERS) as pool:
-        for view in views:
-            n, n_frames = 1, list(view.frames)
-            if not n_frames:
-                raise CaptureError(f"view '{view.plan.camera}': no frames came")
-            n = stride_for(n_frames[0][1].shape[0] * n_frames[0][1].shape[1], pixels)
-            strides[rig.index(view.plan.camera)] = n
-            if n == 1:
-                made.append(replace(view, frames=n_frames))
-                continue
-            few = list(pool.map(lambda f, n=n: _thin(f, n), [f for _, f in n_frames]))  # type: ignore[misc]
-            color = None if view.color is None else _thin(view.color, n)
-            keys = [key for key, _ in n_frames]
-            made.append(replace(view, frames=list(zip(keys, few, strict=True)), color=color))
-    return tuple(made), thinned_rig(rig, tuple(strides))
+        made = list(pool.map(lambda view: _thinned(view, rig.camera(view.plan.camera).lens, pixels), views))
+    strides = [1] * len(rig.cameras)
+    for view, n in made:
+        strides[rig.index(view.plan.camera)] = n
+    return tuple(view for view, _ in made), thinned_rig(rig, tuple(strides))
 
 
-def stride_for(size: int, pixels: int = PIXELS) -> int:
-    """The odd number n for which `size` / n^2 comes nearest to `pixels`, as a ratio."""
+def _thinned(view: ViewInput, lens: Lens, pixels: int) -> tuple[ViewInput, int]:
+    """One view with every n-th row and column, and n."""
+    n = 0
+    few: list[tuple[FrameKey, AnyArray]] = []
+    for key, frame in view.frames:
+        n = n or (stride_for(frame.shape, pixels) if frame.shape[:2] == (lens.height, lens.width) else 1)
+        few.append((key, _thin(frame, n)))
+    if not few:
+        raise CaptureError(f"view '{view.plan.camera}': no frames came")
+    return replace(view, frames=few, color=None if view.color is None else _thin(view.color, n)), n
+
+
+def stride_for(shape: tuple[int, ...], pixels: int) -> int:
+    """The odd number n for which every n-th row and column of a picture (H, W, ...) leaves the ratio nearest to 1 of
+    the pixels left over `pixels`.
+    """
+    size = max(1, shape[0] * shape[1])
     n = max(1, 2 * int(math.sqrt(size / pixels) / 2) + 1)
     return min((m for m in (n - 2, n, n + 2) if m > 0), key=lambda m: abs(math.log(size / (m * m * pixels))))
 
 
 def _thin(frame: AnyArray, n: int) -> AnyArray:
-    """Every n-th row and column, contiguous."""
-    return np.ascontiguousarray(frame[::n, ::n])
+    """Every n-th row and column, contiguous; for n = 1 the frame as it is."""
+    return frame if n == 1 else np.ascontiguousarray(frame[::n, ::n])
 
 
 @lru_cache(maxsize=8)
