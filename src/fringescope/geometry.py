@@ -217,7 +217,7 @@ def common_depths(rig: Rig, camera: Camera) -> tuple[float, float]:
     rays = np.concatenate([n, np.ones((15, 15, 1))], -1)
     depths = np.geomspace(base / 20, base * 20, 241)
     back = inverse(camera.pose)
-    share = np.array([float(field_of_view(rig, transform(back, rays * z)).mean()) for z in depths])
+    share = field_of_view(rig, transform(back, rays * depths[:, None, None, None])).mean(axis=(1, 2))
     if not share.any():
         raise RigError(f"camera '{camera.name}' and the other devices of the rig share no view; check the poses")
     ok = depths[share >= 0.1 * share.max()]

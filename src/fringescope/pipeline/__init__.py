@@ -301,14 +301,14 @@ def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = No
     and as `scan_view`.
     """
     s = settings or Settings()
-    few, thin = coarse.thinned(views, rig, s.mesh.preview_pixels)
+    few, thin, strides = coarse.thinned(views, rig, s.mesh.preview_pixels)
 
-    def one(view: ViewInput) -> tuple[Grid, Photo, tuple[str, ...]]:
-        decoded, grid = scan_view(view, thin, s)
+    def one(view: ViewInput, n: int) -> tuple[Grid, Photo, tuple[str, ...]]:
+        decoded, grid = scan_view(view, thin, coarse.settings_for(n, s))
         return grid, picture(view, decoded, s), decoded.notes
 
     with ThreadPoolExecutor(WORKERS) as pool:  # small pictures leave cores idle
-        made = sorted(pool.map(one, few), key=lambda m: m[0].view)
+        made = sorted(pool.map(one, few, strides), key=lambda m: m[0].view)
     grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
     if not any(g.valid.any() for g in grids):
         words = [w for g in grids for w in denoise.verdict(g).words[1:]]

@@ -11,12 +11,13 @@ from functools import lru_cache
 import numpy as np
 
 from fringescope.errors import CaptureError
+from fringescope.settings import Settings
 from fringescope.threads import WORKERS
 from fringescope.types import AnyArray, Camera, FrameKey, Lens, Rig, ViewInput
 
 
-def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[ViewInput, ...], Rig]:
-    """The views with every n-th row and column alone, and the rig whose cameras have such pixels.
+def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[ViewInput, ...], Rig, tuple[int, ...]]:
+    """The views with every n-th row and column alone, the rig whose cameras have such pixels, and n of each view.
 
     n is odd, so that every colour of a mosaic comes in, and leaves about `pixels` of each view: from a third to three
     times as many, fewer only where a view has fewer. A view of another size than the rig's stays whole, for the stages
@@ -28,7 +29,12 @@ def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[Vi
     strides = [1] * len(rig.cameras)
     for view, n in made:
         strides[rig.index(view.plan.camera)] = n
-    return tuple(view for view, _ in made), thinned_rig(rig, tuple(strides))
+    return tuple(view for view, _ in made), thinned_rig(rig, tuple(strides)), tuple(n for _, n in made)
+
+
+def settings_for(n: int, s: Settings) -> Settings:
+    """Settings for every n-th pixel: the phase may step so much more between neighbours."""
+    return replace(s, denoise=replace(s.denoise, jump_floor_rad=n * s.denoise.jump_floor_rad))
 
 
 def _thinned(view: ViewInput, lens: Lens, pixels: int) -> tuple[ViewInput, int]:
