@@ -6,11 +6,11 @@ parts it is made of. `preview` is what can be shown first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,7 @@ from fringescope.types import (
 if TYPE_CHECKING:  # they import much of SciPy, which a scan can do without: only the recipes that need them load them
     from fringescope import calibrate, evaluate
 
+T = TypeVar("T")
 Progress = Callable[[str, float], None]  #: called with what is being done and the share that is done, 0 to 1
 
 
@@ -307,7 +308,7 @@ def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = No
         decoded, grid = scan_view(view, thin, coarse.settings_for(n, s))
         return grid, picture(view, decoded, s), decoded.notes
 
-    with ThreadPoolExecutor(WORKERS) as pool:  # small pictures leave cores idle
+    with ThreadPoolExecutor(WORKERS) as pool:  # little pictures leave cores idle
         made = sorted(pool.map(one, few, strides), key=lambda m: m[0].view)
     grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
     if not any(g.valid.any() for g in grids):
@@ -351,13 +352,19 @@ def scan(
         times["preview"] = perf_counter() - start
         if coarsest is not None:
             first(coarsest)
-    for n, view in enumerate(views):
-        tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
+
+    def one(view: ViewInput) -> tuple[Decoded, Grid, Photo, float]:
         start = perf_counter()
         decoded, grid = scan_view(view, rig, s, device=device)
+        return decoded, grid, picture(view, decoded, s), perf_counter() - start
+
+    made = _each(one, views, rig) if device == "cpu" else map(one, views)
+    for n, view in enumerate(views):
+        tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
+        decoded, grid, photo, took = next(made)
         grids.append(grid)
-        photos.append(picture(view, decoded, s))
-        times[f"scan_view {grid.camera}"] = perf_counter() - start
+        photos.append(photo)
+        times[f"scan_view {grid.camera}"] = took
         figures["views"][grid.camera] = _figures(view, decoded, grid)
         figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
         notes[grid.camera] = tuple(f"{grid.camera}: {note}" for note in decoded.notes)
@@ -390,6 +397,19 @@ def scan(
     figures["times_s"] = times
     fine, coarse = (levels[0], levels[-1]) if levels else (None, None)
     return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, coarse, every)
+
+
+LITTLE = 1_000_000  #: pixels of pictures that leave cores idle
+
+
+def _each(work: Callable[[ViewInput], T], views: Sequence[ViewInput], rig: Rig) -> Iterator[T]:
+    """What `work` gives for each view, in their order; little pictures whose frames are there are worked on at once."""
+    sizes = [rig.camera(v.plan.camera).lens for v in views]
+    if all(L.width * L.height <= LITTLE for L in sizes) and all(isinstance(v.frames, Sized) for v in views):
+        with ThreadPoolExecutor(WORKERS) as pool:
+            yield from pool.map(work, views)
+    else:
+        yield from map(work, views)
 
 
 def _preview_if_any(views: Sequence[ViewInput], rig: Rig, s: Settings) -> Surface | None:
