@@ -60,7 +60,7 @@ def test_a_thinned_lens_sees_what_the_full_one_sees(n):
 
 @pytest.mark.parametrize("size", [1, 100, 311_904, 599_000, 601_000, 1_250_000, 5_000_000, 20_000_000, 80_000_000])
 def test_strides_are_odd_and_leave_about_what_is_asked_for(size):
-    n = coarse.stride_for((1, size), 200_000)
+    n = coarse.stride_for(Lens(size, 1, np.eye(3), np.zeros(5)), 200_000)
     assert n % 2 == 1
     assert n == 1 or 200_000 / 3 <= size / n**2 <= 600_000
     assert n > 1 or size <= 600_000
@@ -84,6 +84,17 @@ def test_every_colour_of_a_mosaic_comes_in_and_frames_are_copied_once():
     (same,), rig_itself, _ = coarse.thinned([view], rig, 40_000)
     assert same.frames[0][1] is view.frames[0][1]
     assert rig_itself.cameras[0].lens.width == 230
+
+
+def test_packed_frames_are_thinned_as_they_lie():
+    rig = rig_of(1)
+    view = drawn(rig, rig.cameras[0], *usual(0.4), pixel_format=PixelFormat.MONO12)
+    packed = [(k, np.stack([f[:, ::2] & 255, (f[:, ::2] >> 8) | ((f[:, 1::2] & 15) << 4), f[:, 1::2] >> 4], -1)
+               .astype(np.uint8)) for k, f in view.frames]  # fmt: skip
+    (want,), _, _ = coarse.thinned([view], rig, 4000)
+    (few,), _, _ = coarse.thinned([replace(view, frames=packed)], rig, 4000)
+    for (_, a), (_, b) in zip(few.frames, want.frames, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 PLANS = {

@@ -142,6 +142,42 @@ def test_frames_of_any_memory_layout():
     np.testing.assert_array_equal(got[0].reasons, want[0].reasons)
 
 
+def packed(frame):
+    """GenICam 12p by its definition: a stream of bits, lowest first, in octets filled from their low end."""
+    bits = (frame[..., None] >> np.arange(12, dtype=np.uint16)) & 1
+    octets = np.packbits(bits.astype(np.uint8).reshape(frame.shape[0], -1), axis=1, bitorder="little")
+    return octets.reshape(frame.shape[0], frame.shape[1] // 2, 3)
+
+
+@pytest.mark.parametrize("pixel_format", [PixelFormat.MONO12, PixelFormat.BAYER_RG12])
+@pytest.mark.parametrize("rows_apart", [False, True])
+def test_packed_frames_are_read_as_they_come(pixel_format, rows_apart):
+    rig = rig_of(1166, 23)  # more than two blocks of pixels
+    view = view_of(rig, rig.cameras[0], pixel_format, A=0.6, B=0.5)  # some saturated
+    frames = [(key, packed(f)) for key, f in view.frames]
+    if rows_apart:
+        frames = [(key, np.repeat(f, 2, axis=0)[::2]) for key, f in frames]
+    color = view.frames[0][1]
+    whole, grid = pipeline.scan_view(view, rig, S)
+    got, same = pipeline.scan_view(replace(view, frames=frames), rig, S)
+    assert grid.valid.any()
+    np.testing.assert_array_equal(same.xyz, grid.xyz)
+    np.testing.assert_array_equal(same.reasons, grid.reasons)
+    np.testing.assert_array_equal(got.background, whole.background)
+    staged = [pipeline.decode_view(replace(view, frames=f), S).directions[0].phase for f in (view.frames, frames)]
+    np.testing.assert_array_equal(*staged)
+    photos = [pipeline.picture(replace(view, color=c), whole, S).rgb for c in (color, packed(color))]
+    np.testing.assert_array_equal(*photos)
+
+
+def test_packed_frames_of_other_formats_are_refused():
+    rig = rig_of(158, 83)
+    view = view_of(rig, rig.cameras[0], PixelFormat.MONO16)
+    wrong = [(key, packed(f >> 4)) for key, f in view.frames]
+    with pytest.raises(CaptureError, match=r"83, 79, 3\); Mono16 needs \(H, W\)"):
+        pipeline.scan_view(replace(view, frames=wrong), rig, S)
+
+
 def test_noise_alone_gives_no_point():
     rig = rig_of()
     view = view_of(rig, rig.cameras[1], PixelFormat.MONO8, A=0.0, B=0.0, noise=(4.0, 0.0))

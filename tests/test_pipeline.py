@@ -73,6 +73,7 @@ def test_words_and_figures(scan):
         assert v.points == g.valid.sum()
         assert v.words[0].startswith(f"{v.camera}: {v.points} points on ")
         figures = made.figures["views"][v.camera]
+        assert figures["way"] == "fused"
         assert figures["noise"]["source"] == "residuals"
         assert 0 < figures["sigma_median_mm"] < 0.1
         assert figures["modulation_median"] == pytest.approx(70, abs=2)

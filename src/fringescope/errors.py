@@ -37,6 +37,10 @@ class OutputError(FringescopeError):
     """A result cannot be written: the folder exists, is not writable, or the disk is full."""
 
 
+class ResourceError(FringescopeError):
+    """The machine has too little memory for a job, which is refused before it begins; the message has the figures."""
+
+
 class DeviceError(FringescopeError):
     """Base of what devices raise."""
 

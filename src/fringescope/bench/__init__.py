@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 
 from fringescope import __version__, denoise, memory, phase, pipeline
+from fringescope.bench import growth as grows
 from fringescope.bench.frames import views_of
 from fringescope.bench.peers import median_time
 from fringescope.errors import UsageError
@@ -34,7 +35,6 @@ from fringescope.settings import Settings
 from fringescope.types import AnyArray, FringeSet, Rig, ViewInput
 
 BYTES_OUT = 17  #: xyz, sigma, reason of a pixel
-GROWTH = (0.25, 1.0, 5.0, 20.0, 80.0)  #: megapixels
 PEERS = Path(__file__).with_name("peers.py")
 
 
@@ -49,9 +49,9 @@ def measure(
 ) -> dict[str, Any]:
     """Times everything once on frames of so many megapixels; see the module. Seconds are medians of `repeat`.
 
-    `growth` adds smaller and larger pictures, `whole` three views to the coarse surface that shows first, and to a
-    coloured cloud and meshes. Other people's
-    decoders are timed by the interpreter `peer_python`, or here if they can be imported. Raises UsageError.
+    `growth` adds smaller and larger pictures, more and fewer frames and cores; `whole` three views to the coarse
+    surface that shows first, and to a coloured cloud and meshes. Other people's decoders are timed by the interpreter
+    `peer_python`, or here if they can be imported. Raises UsageError.
     """
     if not 0.01 <= megapixels <= 200 or repeat < 1:
         raise UsageError(f"{megapixels} megapixels, {repeat} times; needed 0.01 to 200, and once at least")
@@ -98,7 +98,15 @@ def measure(
         pipeline.scan(views, rig, s)
         out["surface_s"] = perf_counter() - start
     if growth:
-        out["ns_per_pixel"] = _growth(megapixels, one, repeat, s, tell)
+        del views
+
+        def timer(rig: Rig, view: ViewInput) -> dict[str, float]:
+            return _one_view(rig, view, repeat, s)
+
+        out["ns_per_pixel"] = grows.pixels(megapixels, one, timer, tell)
+        out["ns_per_pixel_by_frames"] = grows.frames(timer, tell)
+        out["ns_per_pixel_by_cores"] = grows.cores(repeat, tell)
+        out["growth_megapixels"] = grows.FEW
     return out
 
 
@@ -120,9 +128,10 @@ def lines(result: dict[str, Any]) -> list[str]:
     if "surface_s" in result:
         out.append(f"  {'... a coarse surface first':24} {'':15} {result['coarse_surface_s'] * 1e3:10.1f} ms")
         out.append(f"  {'three views to a surface':24} {'':15} {result['surface_s'] * 1e3:10.1f} ms")
-    for size, one in result.get("ns_per_pixel", {}).items():
-        each = ", ".join(f"{name.replace('_', ' ')} {t:.1f}" for name, t in one.items())
-        out.append(f"  {size:>5} megapixels, ns a pixel: {each}")
+    for key, what in (("", "megapixels"), ("_by_frames", "frames"), ("_by_cores", "cores")):
+        for size, one in result.get("ns_per_pixel" + key, {}).items():
+            each = ", ".join(f"{name.replace('_', ' ')} {t:.1f}" for name, t in one.items())
+            out.append(f"  {size:>5} {what}, ns a pixel: {each}")
     return out
 
 
@@ -173,19 +182,10 @@ def _memory(rig: Rig, view: ViewInput, s: Settings) -> tuple[int, int]:
     return given + sum(a.nbytes for a in made), given + peak
 
 
-def _growth(
-    megapixels: float, own: dict[str, float], repeat: int, s: Settings, tell: Callable[[str, float], None]
-) -> dict[str, dict[str, float]]:
-    out = {}
-    for size in sorted({*GROWTH, megapixels}):
-        tell(f"{size:g} megapixels", 0.85)
-        if size == megapixels:
-            one = own
-        else:
-            rig, views = views_of(size, 1)
-            one = _one_view(rig, views[0], repeat, s)
-        out[f"{size:g}"] = {name: 1e3 * t / size for name, t in one.items()}
-    return out
+def one_view_of(megapixels: float, repeat: int) -> dict[str, float]:
+    """Seconds of the steps of one view of so many megapixels."""
+    rig, views = views_of(megapixels, 1)
+    return _one_view(rig, views[0], repeat, Settings())
 
 
 def _others(view: ViewInput, python: Path | None, repeat: int) -> dict[str, float | str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,16 +17,23 @@ ZOOM = 1.3  #: focal length over the paper's
 BAND = 128  #: rows that are drawn at a time
 
 
-def views_of(megapixels: float, count: int) -> tuple[Rig, list[ViewInput]]:
+def views_of(megapixels: float, count: int, steps: Sequence[int] = ()) -> tuple[Rig, list[ViewInput]]:
     """The paper's rig with sensors of so many pixels (more than the real ones are finer), and `count` views' frames.
 
-    The lenses are a little longer than the paper's, so that fringes cover the pictures.
+    The lenses are a little longer than the paper's, so that fringes cover the pictures. `steps`: of the three sets, in
+    place of the paper's 4, 4 and 8.
     """
     scale = math.sqrt(megapixels * 1e6 / FULL)
     rig = presets.instrument("paper", min(scale, 1.0)).rig
     rig = Rig(rig.projector, tuple(_zoomed(c, max(scale, 1.0)) for c in rig.cameras), rig.volume)
     plan = patterns.paper_plan(rig, PixelFormat.MONO8)
-    return rig, [view_of(rig, v, np.random.default_rng(i)) for i, v in enumerate(plan.views[:count])]
+    views = [_with_steps(v, steps) if steps else v for v in plan.views[:count]]
+    return rig, [view_of(rig, v, np.random.default_rng(i)) for i, v in enumerate(views)]
+
+
+def _with_steps(plan: ViewPlan, steps: Sequence[int]) -> ViewPlan:
+    sets = [replace(one, steps=n) for one, n in zip(plan.sets, steps, strict=True) if isinstance(one, FringeSet)]
+    return replace(plan, sets=tuple(sets))
 
 
 def _zoomed(camera: Camera, scale: float) -> Camera:

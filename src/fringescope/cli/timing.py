@@ -15,7 +15,10 @@ from fringescope.cli.common import Json, Progress, emit
 def bench(
     megapixels: Annotated[float, typer.Option(help="Size of a camera's picture.")] = 20.0,
     repeat: Annotated[int, typer.Option(help="Times that each thing is timed; the median counts.")] = 5,
-    growth: Annotated[bool, typer.Option("--growth", help="Also 0.25 to 80 megapixels (24 GB of memory).")] = False,
+    growth: Annotated[
+        bool, typer.Option("--growth", help="Also 0.25 to 80 megapixels (8 GB of memory), frames and cores.")
+    ] = False,
+    plot: Annotated[Path | None, typer.Option(help="Draw the growth into this SVG file.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="Also three views to a coloured cloud and meshes.")] = False,
     peer_python: Annotated[
         Path | None, typer.Option(help="A Python that has other decoders (fringes), to be timed as well.")
@@ -27,14 +30,22 @@ def bench(
 
     with Progress() as progress:
         result = benchmark.measure(
-            megapixels, repeat, growth=growth, whole=whole, peer_python=peer_python, tell=progress.share
-        )
+            megapixels, repeat, growth=growth or plot is not None, whole=whole, peer_python=peer_python,
+            tell=progress.share,
+        )  # fmt: skip
+    if plot is not None:
+        from fringescope.bench.plot import drawing
+
+        plot.write_text(drawing(result), encoding="utf-8")
     emit(result, json, benchmark.lines(result))
 
 
 @app.command()
 def warmup(json: Json = False) -> None:
-    """Compiles the kernels for this processor now, so that the first scan need not; they are kept on disk."""
+    """Compiles the kernels for this processor now, so that no scan need; they are kept on disk.
+
+    Takes two minutes or more the first time, seconds when all is there. Without it the first scan takes as long.
+    """
     from time import perf_counter
 
     start = perf_counter()

@@ -34,7 +34,7 @@ from fringescope.kernels.blocks import (
 from fringescope.kernels.depths import mark_outside, points, row_cubics
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
 from fringescope.kernels.pixel import TWO_PI
-from fringescope.kernels.raw import samples_at
+from fringescope.kernels.raw import samples_at, unpack
 from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
 
@@ -166,11 +166,11 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
     return reasons, best / turn, own / turn, a, b
 
 
-@by_rows(lambda _addresses, _bytes, _like, _sets, _limits, _bounds, _usual, _depths, phase, *_: phase.shape[0])
-def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual, depths,
+@by_rows(lambda _addresses, _bytes, _like, _packed, _sets, _limits, _bounds, _usual, _depths, phase, *_: phase.shape[0])
+def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths,
            phase, sigma, background, modulation, reasons, xyz, sigma_mm):  # fmt: skip
     """Raw frames to points: the rows of frame f lie `row_bytes[f]` apart in memory, from `addresses[f]` on, as samples
-    of the type of the array `like`.
+    of the type of the array `like`; or `packed`, two samples of 12 bits in three octets.
 
     Writes (H, W) absolute phase of the finest set and its sigma, radians; A and B, codes; reason bits; world points,
     mm, and their sigma along the ray. `bounds` (4, h', w') and `usual` (h'', w'') span the picture corner on corner:
@@ -178,7 +178,7 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
     """
     F, K = len(addresses), len(sets.frequency)
     height, W = phase.shape
-    x = np.empty((F, BLOCK), like.dtype)
+    x, octet = np.empty((F, BLOCK), like.dtype), np.empty(0, np.uint8)
     top = np.empty(BLOCK, like.dtype)
     acc = np.empty(4 * BLOCK, np.float32)
     wrapped, own = np.empty((K, BLOCK), np.float32), np.empty((K, BLOCK), np.float32)
@@ -211,8 +211,11 @@ def decode(first, last, addresses, row_bytes, like, sets, limits, bounds, usual,
         for col in range(0, W, BLOCK):
             n = min(BLOCK, W - col)
             for f in range(F):
-                source = samples_at(addresses[f] + i * row_bytes[f] + col * like.itemsize, n, like)
-                target = x[f]
+                target, row_begins = x[f], addresses[f] + i * row_bytes[f]
+                if packed:
+                    unpack(samples_at(row_begins + col // 2 * 3, n // 2 * 3, octet), n, target)
+                    continue
+                source = samples_at(row_begins + col * like.itemsize, n, like)
                 for j in range(n):
                     target[j] = source[j]
             for j in range(n):

@@ -1,9 +1,14 @@
-"""Samples by their address: a kernel reads the frames of a view where they lie, however many there are."""
+"""Samples as a camera delivers them: by their address, so that a kernel reads the frames of a view where they lie,
+however many there are; and packed, 12 bits each (GenICam's 12p: the lowest bits first).
+"""
 
 from typing import Any
 
+import numpy as np
 from numba import carray, njit, types
 from numba.extending import intrinsic
+
+from fringescope.threads import by_rows
 
 
 @intrinsic
@@ -20,3 +25,19 @@ def _pointer(_typing: Any, _address: Any) -> Any:
 def samples_at(address, n, like):
     """`n` samples at an address, of the type of the array `like`. The caller holds the memory."""
     return carray(_pointer(address), n, like.dtype)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def unpack(octets, n, out):
+    """n samples (an even number) of 12 bits from 3 n / 2 octets."""
+    for p in range(n // 2):
+        a, b, c = np.uint16(octets[3 * p]), np.uint16(octets[3 * p + 1]), np.uint16(octets[3 * p + 2])
+        out[2 * p] = a | ((b & 15) << 8)
+        out[2 * p + 1] = (b >> 4) | (c << 4)
+
+
+@by_rows(lambda _packed, out: out.shape[0])
+def unpack_frame(first, last, packed, out):
+    """Packed samples (H, W / 2, 3) uint8 to (H, W) uint16."""
+    for i in range(first, last):
+        unpack(packed[i].reshape(-1), out.shape[1], out[i])

@@ -15,7 +15,7 @@ from fringescope.phase.order import (
     trial,
     unambiguous_span,
 )
-from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, mean_picture
+from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, mean_picture, thinned, unpacked
 from fringescope.phase.vote import vote_on_orders
 
 __all__ = [
@@ -33,8 +33,10 @@ __all__ = [
     "put_rows",
     "room_for",
     "settle_order",
+    "thinned",
     "trial",
     "unambiguous_span",
+    "unpacked",
     "vote_on_orders",
     "with_reasons",
 ]

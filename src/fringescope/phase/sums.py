@@ -10,6 +10,7 @@ import numpy as np
 
 from fringescope.errors import CaptureError
 from fringescope.kernels import fringes as k
+from fringescope.kernels import raw
 from fringescope.types import (
     F32,
     F64,
@@ -25,12 +26,27 @@ from fringescope.types import (
 )
 
 
+def unpacked(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
+    """A frame with one sample per element: packed 12-bit frames (H, W / 2, 3) become (H, W) uint16."""
+    if not pixel_format.packs(frame):
+        return frame
+    out = np.empty((frame.shape[0], 2 * frame.shape[1]), np.uint16)
+    raw.unpack_frame(np.ascontiguousarray(frame), out)
+    return out
+
+
+def thinned(frame: AnyArray, pixel_format: PixelFormat, every: int) -> AnyArray:
+    """Every so many-th row and column of a frame (H, W), unpacked."""
+    return unpacked(frame[::every], pixel_format)[:, ::every]
+
+
 def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
     """One sample per pixel: raw Bayer and mono frames as they are, RGB as the sum of its channels (uint16).
 
     A pixel with one saturated channel counts as saturated: it gets the largest sum. Raises CaptureError if the frame is
     not (H, W), or (H, W, 3) for RGB.
     """
+    frame = unpacked(frame, pixel_format)
     rgb = pixel_format is PixelFormat.RGB8
     if frame.ndim != (3 if rgb else 2) or (rgb and frame.shape[2] != 3):
         needed = "(H, W, 3)" if rgb else "(H, W)"

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fringescope import denoise, fuse, geometry, phase, response, triangulate
-from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
+from fringescope import denoise, fuse, geometry, memory, phase, response, triangulate
+from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, ResourceError, UsageError
 from fringescope.pipeline import coarse, fast
 from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
@@ -291,7 +291,7 @@ def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:
     plan = view.plan
     if view.color is None:
         return fuse.photo_from_background(decoded.background, plan.pixel_format, plan.camera, s.fuse)
-    return fuse.photo(view.color, plan.pixel_format, plan.camera, s.fuse)
+    return fuse.photo(phase.unpacked(view.color, plan.pixel_format), plan.pixel_format, plan.camera, s.fuse)
 
 
 def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = None) -> Surface:
@@ -338,6 +338,7 @@ def scan(
     view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
+    _check_memory(views, rig, at_once=first is not None)
     tell = progress or _silent
     times: dict[str, float] = {}
     grids: list[Grid] = []
@@ -395,8 +396,8 @@ def scan(
         times["mesh"] = perf_counter() - start
     tell("done", 1.0)
     figures["times_s"] = times
-    fine, coarse = (levels[0], levels[-1]) if levels else (None, None)
-    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, coarse, every)
+    fine, small = (levels[0], levels[-1]) if levels else (None, None)
+    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, small, every)
 
 
 LITTLE = 1_000_000  #: pixels of pictures that leave cores idle
@@ -419,6 +420,33 @@ def _preview_if_any(views: Sequence[ViewInput], rig: Rig, s: Settings) -> Surfac
         return None
 
 
+VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud
+
+
+def _check_memory(views: Sequence[ViewInput], rig: Rig, at_once: bool) -> None:
+    """Raise ResourceError if the machine has too little memory left for a scan of these views; `at_once`: all their
+    frames are held.
+    """
+    free = memory.available()
+    if free is None or not views:
+        return
+    lenses = [rig.camera(v.plan.camera).lens for v in views]
+    pixels = [lens.width * lens.height for lens in lenses]
+    unread = [0 if isinstance(v.frames, list | tuple) else len(v.plan.keys) * v.plan.pixel_format.dtype.itemsize
+              for v in views]  # fmt: skip
+    frames = [n * u for n, u in zip(pixels, unread, strict=True)]
+    if at_once:
+        need = max(n * VIEW_BYTES for n in pixels) + sum(frames)
+    else:
+        need = max(n * VIEW_BYTES + f for n, f in zip(pixels, frames, strict=True))
+    need += sum(pixels) * (KEPT_BYTES + CLOUD_BYTES)
+    if need > free:
+        raise ResourceError(
+            f"{len(views)} views, {sum(pixels) / 1e6:.1f} megapixels in all, need about {need / 1e9:.1f} GB of memory; "
+            f"{free / 1e9:.1f} GB are free: close other programs, or scan fewer views or smaller pictures at a time"
+        )
+
+
 def _silent(_what: str, _share: float) -> None:
     """No progress is shown."""
 
@@ -431,6 +459,7 @@ def _figures(view: ViewInput, decoded: Decoded, grid: Grid) -> dict[str, Any]:
     sigma, A, B = (a[cut][ok] for a in (grid.sigma, decoded.background, decoded.modulation))
     r = view.response
     return {
+        "way": "staged" if decoded.sets or decoded.gray else "fused",
         "response": None if r is None else {"gamma": r.gamma, "needed": r.needed},
         "noise": {"a": decoded.noise.a, "b": decoded.noise.b, "source": decoded.noise.source},
         "sigma_median_mm": float(np.median(sigma)) if ok.any() else None,

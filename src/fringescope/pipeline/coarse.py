@@ -10,10 +10,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from fringescope import phase
 from fringescope.errors import CaptureError
 from fringescope.settings import Settings
 from fringescope.threads import WORKERS
-from fringescope.types import AnyArray, Camera, FrameKey, Lens, Rig, ViewInput
+from fringescope.types import AnyArray, Camera, FrameKey, Lens, PixelFormat, Rig, ViewInput
 
 
 def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[ViewInput, ...], Rig, tuple[int, ...]]:
@@ -42,25 +43,26 @@ def _thinned(view: ViewInput, lens: Lens, pixels: int) -> tuple[ViewInput, int]:
     n = 0
     few: list[tuple[FrameKey, AnyArray]] = []
     for key, frame in view.frames:
-        n = n or (stride_for(frame.shape, pixels) if frame.shape[:2] == (lens.height, lens.width) else 1)
-        few.append((key, _thin(frame, n)))
+        if n == 0:
+            columns = frame.shape[1] * (2 if view.plan.pixel_format.packs(frame) else 1)
+            n = stride_for(lens, pixels) if (frame.shape[0], columns) == (lens.height, lens.width) else 1
+        few.append((key, _thin(frame, view.plan.pixel_format, n)))
     if not few:
         raise CaptureError(f"view '{view.plan.camera}': no frames came")
-    return replace(view, frames=few, color=None if view.color is None else _thin(view.color, n)), n
+    color = None if view.color is None else _thin(view.color, view.plan.pixel_format, n)
+    return replace(view, frames=few, color=color), n
 
 
-def stride_for(shape: tuple[int, ...], pixels: int) -> int:
-    """The odd number n for which every n-th row and column of a picture (H, W, ...) leaves the ratio nearest to 1 of
-    the pixels left over `pixels`.
-    """
-    size = max(1, shape[0] * shape[1])
+def stride_for(lens: Lens, pixels: int) -> int:
+    """The odd number n for which every n-th row and column of a picture leave nearest to `pixels`, as a ratio."""
+    size = lens.width * lens.height
     n = max(1, 2 * int(math.sqrt(size / pixels) / 2) + 1)
     return min((m for m in (n - 2, n, n + 2) if m > 0), key=lambda m: abs(math.log(size / (m * m * pixels))))
 
 
-def _thin(frame: AnyArray, n: int) -> AnyArray:
-    """Every n-th row and column, contiguous; for n = 1 the frame as it is."""
-    return frame if n == 1 else np.ascontiguousarray(frame[::n, ::n])
+def _thin(frame: AnyArray, pixel_format: PixelFormat, n: int) -> AnyArray:
+    """Every n-th row and column, unpacked and contiguous; for n = 1 the frame as it is."""
+    return frame if n == 1 else np.ascontiguousarray(phase.thinned(frame, pixel_format, n))
 
 
 @lru_cache(maxsize=8)

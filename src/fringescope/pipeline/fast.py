@@ -77,7 +77,7 @@ def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> Fu
     way = way_of(view, rig, s)
     if way is None:
         return None
-    H, W = way.frames[0].shape
+    H, W = _size(way.frames[0])
     absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
     reasons, xyz = memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32)
     out = (absolute, sigma, A, B, reasons, xyz, sigma_mm)
@@ -86,7 +86,8 @@ def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> Fu
 
         if not gpu.takes(way.sets):
             return None
-        gpu.by_slabs(way.frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
+        frames = [phase.unpacked(f, view.plan.pixel_format) for f in way.frames]
+        gpu.by_slabs(frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
     else:
         on_cpu(way, out)
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
@@ -130,13 +131,14 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
     frames = _in_order(view, family) if family else None
     if frames is None or family is None or view.response is not None:
         return None
-    H, W = frames[0].shape
+    H, W = _size(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
         return None  # the stages say what is wrong
     numbers, g = [n for n, _ in family], family[-1][1]
     steps = [_fringes(plan, n).steps for n in numbers]
     every = denoise.odd_stride(H * W)
-    few = phase.measure([(key, f[::every, ::every]) for key, f in view.frames], plan, s.phase, view.noise)
+    thin = [(key, phase.thinned(f, plan.pixel_format, every)) for key, f in view.frames]
+    few = phase.measure(thin, plan, s.phase, view.noise)
     if few.background is not few.sets[numbers[-1]].background:
         return None  # the finest set is not the most accurate one
     table = _table(rig, camera, g, s.denoise.volume_margin)
@@ -193,7 +195,7 @@ def _in_order(
     """The frames of the sets, coarse to fine, step by step; None if any is missing, doubled or unlike the others."""
     there: dict[FrameKey, AnyArray] = {}
     for key, frame in view.frames:
-        if key in there or frame.ndim != 2:
+        if key in there or (frame.ndim != 2 and not view.plan.pixel_format.packs(frame)):
             return None
         there[key] = frame
     keys = [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(view.plan, n).steps)]
@@ -204,6 +206,11 @@ def _in_order(
     if any(f.shape != like.shape or f.dtype != like.dtype for f in frames) or like.dtype not in (np.uint8, np.uint16):
         return None
     return frames if min(like.shape) >= 1 else None
+
+
+def _size(frame: AnyArray) -> tuple[int, int]:
+    """Rows and columns of pixels of a frame, which may be packed."""
+    return frame.shape[0], frame.shape[1] if frame.ndim == 2 else 2 * frame.shape[1]
 
 
 def _table(rig: Rig, camera: Camera, g: tuple[float, float], margin: float) -> geometry.DepthTable | None:
@@ -248,9 +255,10 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
 
 
 def on_cpu(way: Way, out: tuple[AnyArray, ...]) -> None:
-    """Runs the kernel over rows on all cores; it reads the frames where they lie."""
-    frames = [f if f.strides[1] == f.itemsize else np.ascontiguousarray(f) for f in way.frames]
+    """Runs the kernel over rows on all cores; it reads the frames where they lie, packed ones too."""
+    frames = [f if f[0].flags.c_contiguous else np.ascontiguousarray(f) for f in way.frames]
     addresses = np.array([f.ctypes.data for f in frames], np.int64)
     row_bytes = np.array([f.strides[0] for f in frames], np.int64)
-    like = np.empty(0, frames[0].dtype)
-    k.decode(addresses, row_bytes, like, way.sets, way.limits, way.bounds, way.usual, way.depths, *out)
+    packed = frames[0].ndim == 3
+    like = np.empty(0, np.uint16 if packed else frames[0].dtype)
+    k.decode(addresses, row_bytes, like, packed, way.sets, way.limits, way.bounds, way.usual, way.depths, *out)

@@ -160,8 +160,9 @@ class RowFrames(Protocol):
 class ViewInput:
     """What the pipeline takes of one view: its plan, its frames one by one in any order, its ring-light picture.
 
-    A frame is (H, W) uint8 or uint16 (RGB8: (H, W, 3)), raw as the sensor gave it. `color` is raw in
-    the same format, or None. `response`: what its phases are to be freed from, or None.
+    A frame is (H, W) uint8 or uint16 (RGB8: (H, W, 3)), raw as the sensor gave it. Samples of 12 bits may come packed
+    as cameras send them (GenICam 12p), two in three octets: (H, W / 2, 3) uint8. `color` is raw in the same format, or
+    None. `response`: what its phases are to be freed from, or None.
     """
 
     plan: ViewPlan

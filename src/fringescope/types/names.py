@@ -55,6 +55,10 @@ class PixelFormat(Enum):
         """Whether a colour picture can be made of it."""
         return self.is_bayer or self is PixelFormat.RGB8
 
+    def packs(self, frame: AnyArray) -> bool:
+        """Whether a frame holds two samples of 12 bits in three octets: (H, W / 2, 3) uint8."""
+        return self.bits == 12 and frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3
+
     @property
     def dtype(self) -> np.dtype[Any]:
         """uint8 up to 8 bits, uint16 (right-aligned) above."""
