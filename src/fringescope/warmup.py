@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fringescope import geometry, patterns, pipeline, report
+from fringescope import denoise, geometry, patterns, pipeline, report
 from fringescope.settings import MeshSettings, Settings
 from fringescope.twin import presets
 from fringescope.types import (
@@ -40,8 +40,11 @@ def drawn_view(rig: Rig, camera: Camera, plan: ViewPlan) -> ViewInput:
     p = p + d * bump[..., None]
     lit = geometry.field_of_view(Rig(rig.projector, (camera,)), p)
 
+    rng = np.random.default_rng(0)
+
     def frame(signal: AnyArray | float, dark: float) -> AnyArray:
-        codes = (np.where(lit, signal, dark) * (fmt.max_value / 255)).round().astype(fmt.dtype)
+        light = np.where(lit, signal, dark) + rng.normal(0, 0.5, u.shape)
+        codes = (np.maximum(light, 0) * (fmt.max_value / 255)).round().astype(fmt.dtype)
         return np.repeat(codes[..., None], 3, axis=2) if fmt is PixelFormat.RGB8 else codes
 
     def frames() -> Iterator[tuple[FrameKey, AnyArray]]:
@@ -73,6 +76,8 @@ def compile_kernels(every_plan: bool = False) -> int:
     views = _views(rig, PixelFormat.BAYER_RG8)
     s = Settings(mesh=MeshSettings(preview_pixels=1000))  # thinned, too
     scan = pipeline.scan(views, rig, s, all_points=True, first=lambda _surface: None)
+    nearer = replace(scan.grids[0], xyz=scan.grids[0].xyz + np.float32([0, 0, 3]))
+    denoise.agree((nearer, *scan.grids[1:]), rig, s.denoise)  # views that disagree
     if scan.surface is not None:
         report.render_surface(scan.surface, size=(64, 48))
     if every_plan:
