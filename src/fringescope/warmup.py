@@ -43,7 +43,7 @@ def drawn_view(rig: Rig, camera: Camera, plan: ViewPlan) -> ViewInput:
     rng = np.random.default_rng(0)
 
     def frame(signal: AnyArray | float, dark: float) -> AnyArray:
-        light = np.where(lit, signal, dark) + rng.normal(0, 0.5, u.shape)
+        light = np.where(lit, signal, dark) + rng.normal(0, 1.5, u.shape)
         codes = (np.maximum(light, 0) * (fmt.max_value / 255)).round().astype(fmt.dtype)
         return np.repeat(codes[..., None], 3, axis=2) if fmt is PixelFormat.RGB8 else codes
 
