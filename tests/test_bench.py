@@ -23,6 +23,7 @@ def test_the_command_gives_what_others_read(capsys, monkeypatch):
     assert all(out[name] > 0 for name in NEEDED - {"fringes_fast_over_ours"})
     assert out["peak_memory_over_io"] > 1
     assert out["surface_s"] > 0
+    assert out["coarse_surface_s"] > 0
     lines = bench.lines(out)
     assert "copy floor" in lines[0]
     assert any("x copy" in line for line in lines)

@@ -283,6 +283,9 @@ def _slopes(d: Direction, reasons: U16, decoded: Decoded, rig: Rig | None) -> F6
     return np.full((2, 2, 3), usual or 1.0)
 
 
+MOST = 7  #: other views; with more of them a kernel of its own is compiled
+
+
 def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool = False) -> tuple[Grid, ...]:
     """Where views overlap: a point in front of what another view sees through it, and that no view confirms, goes.
 
@@ -295,7 +298,9 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool
         others = [v for v, o in zip(sights, grids, strict=True) if o.view != g.view]
         bad, lost = np.zeros(g.reasons.shape, np.uint8), np.zeros(len(g.reasons), np.int64)
         if others:
-            views.contradicted(own, tuple(others), float(s.agree_sigma), float(s.agree_slack), bad, lost)
+            n = len(others)
+            filled = tuple(others[min(i, n - 1)] for i in range(max(MOST, n)))  # one kernel for any number
+            views.contradicted(own, filled, n, float(s.agree_sigma), float(s.agree_slack), bad, lost)
         found.append((bad, lost))
     out = []
     for g, (bad, lost) in zip(grids, found, strict=True):  # all are judged before any loses a point

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from fringescope.errors import RigError
 from fringescope.kernels import lens as k
@@ -217,7 +217,7 @@ def common_depths(rig: Rig, camera: Camera) -> tuple[float, float]:
     rays = np.concatenate([n, np.ones((15, 15, 1))], -1)
     depths = np.geomspace(base / 20, base * 20, 241)
     back = inverse(camera.pose)
-    share = np.array([float(field_of_view(rig, transform(back, rays * z)).mean()) for z in depths])
+    share = field_of_view(rig, transform(back, rays * depths[:, None, None, None])).mean(axis=(1, 2))
     if not share.any():
         raise RigError(f"camera '{camera.name}' and the other devices of the rig share no view; check the poses")
     ok = depths[share >= 0.1 * share.max()]
@@ -277,7 +277,8 @@ def _extremes(phi: F64, ok: Bool, name: str) -> tuple[F64, F64]:
         for a, b in np.argwhere(missed):
             c, e = there[np.argmin(((there - (a, b)) ** 2).sum(1))]
             low[a, b], high[a, b] = low[c, e], high[c, e]
-    return np.asarray(minimum_filter(low, 3)), np.asarray(maximum_filter(high, 3))
+    window = np.ones((3, 3), np.uint8)
+    return np.asarray(cv2.erode(low, window)), np.asarray(cv2.dilate(high, window))
 
 
 def epipolar_field(rig: Rig, camera: Camera, g: tuple[float, float], size: tuple[int, int] = (18, 26)) -> F64:

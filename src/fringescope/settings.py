@@ -117,6 +117,7 @@ class MeshSettings(_Section):
 
     triangles: int = knob(200_000, "", "triangles of surface.glb at most", "", 100)
     preview_triangles: int = knob(50_000, "", "triangles of the small level that shows first", "", 100)
+    preview_pixels: int = knob(200_000, "pixels", "about so many of each view make the coarse surface that shows before the fine one", "", 1000)
     max_points: int = knob(400_000, "", "points that are triangulated at most; denser clouds are strided", "", 1000)
     max_edge: float = knob(3.5, "spacings", "longer edges bridge a hole or a shadow and go", "", 1.5)
     jump_slope: float = knob(0.35, "", "an edge that leaves both its ends' tangent planes by more than this share of its length, plus jump_sigma, is a jump", "", 0)

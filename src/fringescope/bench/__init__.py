@@ -49,9 +49,9 @@ def measure(
 ) -> dict[str, Any]:
     """Times everything once on frames of so many megapixels; see the module. Seconds are medians of `repeat`.
 
-    `growth` adds smaller and larger pictures, more and fewer frames and cores; `whole` three views to a coloured cloud
-    and meshes. Other people's decoders are timed by the interpreter `peer_python`, or here if they can be imported.
-    Raises UsageError.
+    `growth` adds smaller and larger pictures, more and fewer frames and cores; `whole` three views to the coarse
+    surface that shows first, and to a coloured cloud and meshes. Other people's decoders are timed by the interpreter
+    `peer_python`, or here if they can be imported. Raises UsageError.
     """
     if not 0.01 <= megapixels <= 200 or repeat < 1:
         raise UsageError(f"{megapixels} megapixels, {repeat} times; needed 0.01 to 200, and once at least")
@@ -91,7 +91,9 @@ def measure(
         "others_over_ours": {name: t / ours for name, t in others.items() if isinstance(t, float)},
     }
     if whole:
-        tell("three views to a surface", 0.8)
+        tell("three views to a coarse surface", 0.8)
+        out["coarse_surface_s"] = median_time(lambda: pipeline.preview(views, rig, s), repeat)
+        tell("three views to a surface", 0.82)
         start = perf_counter()
         pipeline.scan(views, rig, s)
         out["surface_s"] = perf_counter() - start
@@ -124,6 +126,7 @@ def lines(result: dict[str, Any]) -> list[str]:
         else:
             out.append(f"  {name}: {t}")
     if "surface_s" in result:
+        out.append(f"  {'... a coarse surface first':24} {'':15} {result['coarse_surface_s'] * 1e3:10.1f} ms")
         out.append(f"  {'three views to a surface':24} {'':15} {result['surface_s'] * 1e3:10.1f} ms")
     for key, what in (("", "megapixels"), ("_by_frames", "frames"), ("_by_cores", "cores")):
         for size, one in result.get("ns_per_pixel" + key, {}).items():

@@ -406,17 +406,3 @@ def settings_(settings: SettingsFile = None, set_: SetOption = None, json: Json 
 
     s = load_settings(settings, set_)
     emit(to_dict(s), json, [to_yaml(s).rstrip()])
-
-
-@app.command()
-def warmup(json: Json = False) -> None:
-    """Compile the kernels now, so that the first scan does not wait for it."""
-    from time import perf_counter
-
-    from fringescope import warmup as tiny
-
-    with Progress() as progress:
-        start = perf_counter()
-        points = progress.run("compiling", tiny.compile_kernels)
-    took = perf_counter() - start
-    emit({"points": points, "seconds": took}, json, [f"kernels are compiled and cached ({took:.1f} s)"])

@@ -42,7 +42,10 @@ def bench(
 
 @app.command()
 def warmup(json: Json = False) -> None:
-    """Compiles the kernels for this processor now, so that the first scan need not; they are kept on disk."""
+    """Compiles the kernels for this processor now, so that no scan need; they are kept on disk.
+
+    Takes two minutes or more the first time, seconds when all is there. Without it the first scan takes as long.
+    """
     from time import perf_counter
 
     start = perf_counter()

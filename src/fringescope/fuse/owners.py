@@ -46,7 +46,7 @@ class Raster:
 def _sample(grid: Grid) -> F64:
     """Some of a view's points (n, 3); none only if it has none."""
     H, W = grid.sigma.shape
-    for step in (max(1, int(math.sqrt(H * W / _SAMPLES))), 1):
+    for step in (max(1, math.ceil(math.sqrt(H * W / _SAMPLES))), 1):
         p = grid.xyz[::step, ::step].reshape(-1, 3)
         p = p[np.isfinite(p[:, 0])]
         if len(p):

@@ -23,6 +23,7 @@ from fringescope.kernels.views import constant
 from fringescope.settings import FuseSettings
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, Cloud, Grid, Photo, Rig
 
+MOST = 8  #: views that are fused
 _SAMPLES = 60_000  # pixels of a view that tell its sampling
 _NEAR = 3  # squares of `fusing.TILE` pixels: a picture is blended so far around what the view owns (and back)
 
@@ -55,8 +56,8 @@ class Fused:
 def _check(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig) -> None:
     if len(grids) != len(photos):
         raise RigError(f"{len(grids)} grids and {len(photos)} pictures; needed one picture per grid, in the same order")
-    if not 1 <= len(grids) <= 8:
-        raise RigError(f"{len(grids)} views; fusion takes 1 to 8")
+    if not 1 <= len(grids) <= MOST:
+        raise RigError(f"{len(grids)} views; fusion takes 1 to {MOST}")
     for g, p in zip(grids, photos, strict=True):
         if not 0 <= g.view < len(rig.cameras):
             raise RigError(f"view {g.view} of camera '{g.camera}'; the rig has {len(rig.cameras)} cameras")
@@ -193,7 +194,7 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
              for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
     owner = settle_owners(sides, limits, raster, there)
     del there
-    filled = tuple(sides)
+    filled = tuple(sides[min(i, V - 1)] for i in range(MOST))  # always as many, so that one kernel does for any number
     marks = [np.empty(g.sigma.shape, np.uint8) for g in grids]
     squares = [tuple(-(-n // fusing.TILE) for n in g.reasons.shape) for g in grids]
     near = [np.zeros(shape, np.uint8) for shape in squares]

@@ -150,8 +150,8 @@ def examine(x, y, z, sigma, other, tolerance, slack):
 
 
 @by_rows(lambda own, *_: own.height)
-def contradicted(first, last, own, others, tolerance, slack, bad, lost):
-    """Points that one of the `others` looks through, and that none confirms: 1 in `bad` (H, W).
+def contradicted(first, last, own, others, count, tolerance, slack, bad, lost):
+    """Points that one of the first `count` of the `others` looks through, and that none confirms: 1 in `bad` (H, W).
 
     The other surface is interpolated between four pixels that all carry points. Nearer than `tolerance` combined sigmas
     plus `slack` pixel footprints plus the rise among the four: confirmed. In front of it by more: denied. Behind it:
@@ -160,7 +160,7 @@ def contradicted(first, last, own, others, tolerance, slack, bad, lost):
     What is denied lies in front of each of the four by more than its own sigmas and the footprints: only points that
     lie so far in front of the nearest pixel's are examined.
     """
-    W, count = own.width, len(others)
+    W = own.width
     X, Y, Z = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     U, V, D = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     A, B, C = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)

@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from fringescope.phase.sums import Measured
 from fringescope.types import F64, AnyArray, NoiseModel
@@ -106,8 +105,27 @@ def _typical(residual: F64, dof: int) -> float:
 @lru_cache(maxsize=64)
 def _truncation(dof: int) -> tuple[float, float, float]:
     """Of a chi-squared over its degrees of freedom: mean of its lowest 80 %; 99.8 % quantile, and the mean below it."""
-    few, most = float(chi2.ppf(0.8, dof)), float(chi2.ppf(0.998, dof))
-    return float(chi2.cdf(few, dof + 2)) / 0.8, most / dof, float(chi2.cdf(most, dof + 2)) / 0.998
+    few, most = _chi2_quantile(0.8, dof), _chi2_quantile(0.998, dof)
+    return _chi2_share(few, dof + 2) / 0.8, most / dof, _chi2_share(most, dof + 2) / 0.998
+
+
+def _chi2_share(x: float, dof: int) -> float:
+    """Share of a chi-squared of `dof` degrees of freedom below `x` > 0, by its series; SciPy's is slow to import."""
+    a, y = 0.5 * dof, 0.5 * x
+    term = total = 1.0 / a
+    while term > 1e-17 * total:
+        a += 1.0
+        term *= y / a
+        total += term
+    return total * math.exp(0.5 * dof * math.log(y) - y - math.lgamma(0.5 * dof))
+
+
+def _chi2_quantile(share: float, dof: int) -> float:
+    """Where a chi-squared of `dof` degrees of freedom has `share` below it, 0 < share < 1."""
+    low, high = 0.0, dof + 20.0 * math.sqrt(2.0 * dof) + 20.0
+    while (middle := 0.5 * (low + high)) not in (low, high):
+        low, high = (middle, high) if _chi2_share(middle, dof) < share else (low, middle)
+    return high
 
 
 def _unspoilt(sets: Sequence[_Bins]) -> list[_Bins]:

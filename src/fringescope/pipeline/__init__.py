@@ -1,23 +1,25 @@
 """The recipes: which step comes next. Objects in, objects out; reads like Figs. 6 and 7 of the paper.
 
 Two doors: `scan` does the usual thing in one call; `scan_view`, `decode_view` and the stages that they name are the
-parts it is made of.
+parts it is made of. `preview` is what can be shown first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fringescope import calibrate, denoise, evaluate, fuse, geometry, memory, phase, response, triangulate
+from fringescope import denoise, fuse, geometry, memory, phase, response, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, ResourceError, UsageError
-from fringescope.pipeline import fast
+from fringescope.pipeline import coarse, fast
 from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
+from fringescope.threads import WORKERS
 from fringescope.types import (
     F32,
     U16,
@@ -40,6 +42,10 @@ from fringescope.types import (
     ViewPlan,
 )
 
+if TYPE_CHECKING:  # they import much of SciPy, which a scan can do without: only the recipes that need them load them
+    from fringescope import calibrate, evaluate
+
+T = TypeVar("T")
 Progress = Callable[[str, float], None]  #: called with what is being done and the share that is done, 0 to 1
 
 
@@ -127,6 +133,8 @@ def see_board(view: ViewInput, board: Board, pose: str, s: Settings) -> tuple[Si
     Frames are decoded band by band: where `view.frames` can give rows (`RowFrames`), memory does not grow with their
     number. Raises CaptureError or DecodeError for frames that do not fit.
     """
+    from fringescope import calibrate
+
     decoded, mean = decode_bands(view, s)
     try:
         return calibrate.see(decoded, mean, view.plan, board, pose, s.board), mean, ""
@@ -191,6 +199,8 @@ def calibrate_rig(
 
     Raises CalibrationError, with what to photograph, where they do not make a rig.
     """
+    from fringescope import calibrate
+
     tell = progress or _silent
     poses: dict[str, list[Sighting]] = {}
     for one in sightings:
@@ -223,6 +233,8 @@ def verify(
 
     `must_see_board`: no board found is an error, not a doubt. Raises as `scan_view`, and CalibrationError.
     """
+    from fringescope import calibrate, evaluate
+
     tell = progress or _silent
     grids: list[Grid] = []
     sightings: list[Sighting] = []
@@ -282,6 +294,30 @@ def picture(view: ViewInput, decoded: Decoded, s: Settings) -> Photo:
     return fuse.photo(phase.unpacked(view.color, plan.pixel_format), plan.pixel_format, plan.camera, s.fuse)
 
 
+def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = None) -> Surface:
+    """The coarse surface, to be shown before the fine one is made: the same steps on thinned frames.
+
+    About `mesh.preview_pixels` of each view take part, see `coarse.thinned`; the textures are as coarse, the vertices
+    as exact as any point. Raises EmptyResultError, with the reasons, if no view keeps a point or no triangle is left;
+    and as `scan_view`.
+    """
+    s = settings or Settings()
+    few, thin, strides = coarse.thinned(views, rig, s.mesh.preview_pixels)
+
+    def one(view: ViewInput, n: int) -> tuple[Grid, Photo, tuple[str, ...]]:
+        decoded, grid = scan_view(view, thin, coarse.settings_for(n, s))
+        return grid, picture(view, decoded, s), decoded.notes
+
+    with ThreadPoolExecutor(WORKERS) as pool:  # little pictures leave cores idle
+        made = sorted(pool.map(one, few, strides), key=lambda m: m[0].view)
+    grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
+    if not any(g.valid.any() for g in grids):
+        words = [w for g in grids for w in denoise.verdict(g).words[1:]]
+        words += [f"{g.camera}: {note}" for g, _, notes in made for note in notes]
+        raise EmptyResultError("no point was left; " + "; ".join(words))
+    return fuse.preview(fuse.merge(grids, [photo for _, photo, _ in made], thin, s.fuse), thin, s.mesh)
+
+
 def scan(
     views: Sequence[ViewInput],
     rig: Rig,
@@ -291,28 +327,45 @@ def scan(
     surface: bool = True,
     device: Device = "cpu",
     progress: Progress | None = None,
+    first: Callable[[Surface], None] | None = None,
 ) -> Scan:
     """Fringe images of all views to one clean, coloured surface.
 
     `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Where the
     points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. `device`:
-    see `scan_view`. Raises EmptyResultError, with the reasons, if no view keeps a point; and as `scan_view`.
+    see `scan_view`. `first` is called with the coarse surface of `preview` before the fine work begins, and not called
+    where there is none; then all views' frames are held in memory. Raises EmptyResultError, with the reasons, if no
+    view keeps a point; and as `scan_view`.
     """
     s = settings or Settings()
-    _check_memory(views, rig)
+    _check_memory(views, rig, at_once=first is not None)
     tell = progress or _silent
     times: dict[str, float] = {}
     grids: list[Grid] = []
     photos: list[Photo] = []
     notes: dict[str, tuple[str, ...]] = {}
     figures: dict[str, Any] = {"views": {}}
-    for n, view in enumerate(views):
-        tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
+    if first is not None:
+        tell("coarse surface", 0.0)
+        start = perf_counter()
+        views = [replace(view, frames=list(view.frames)) for view in views]
+        coarsest = _preview_if_any(views, rig, s)
+        times["preview"] = perf_counter() - start
+        if coarsest is not None:
+            first(coarsest)
+
+    def one(view: ViewInput) -> tuple[Decoded, Grid, Photo, float]:
         start = perf_counter()
         decoded, grid = scan_view(view, rig, s, device=device)
+        return decoded, grid, picture(view, decoded, s), perf_counter() - start
+
+    made = _each(one, views, rig) if device == "cpu" else map(one, views)
+    for n, view in enumerate(views):
+        tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
+        decoded, grid, photo, took = next(made)
         grids.append(grid)
-        photos.append(picture(view, decoded, s))
-        times[f"scan_view {grid.camera}"] = perf_counter() - start
+        photos.append(photo)
+        times[f"scan_view {grid.camera}"] = took
         figures["views"][grid.camera] = _figures(view, decoded, grid)
         figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
         notes[grid.camera] = tuple(f"{grid.camera}: {note}" for note in decoded.notes)
@@ -343,15 +396,37 @@ def scan(
         times["mesh"] = perf_counter() - start
     tell("done", 1.0)
     figures["times_s"] = times
-    fine, coarse = (levels[0], levels[-1]) if levels else (None, None)
-    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, coarse, every)
+    fine, small = (levels[0], levels[-1]) if levels else (None, None)
+    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, small, every)
+
+
+LITTLE = 1_000_000  #: pixels of pictures that leave cores idle
+
+
+def _each(work: Callable[[ViewInput], T], views: Sequence[ViewInput], rig: Rig) -> Iterator[T]:
+    """What `work` gives for each view, in their order; little pictures whose frames are there are worked on at once."""
+    sizes = [rig.camera(v.plan.camera).lens for v in views]
+    if all(L.width * L.height <= LITTLE for L in sizes) and all(isinstance(v.frames, Sized) for v in views):
+        with ThreadPoolExecutor(WORKERS) as pool:
+            yield from pool.map(work, views)
+    else:
+        yield from map(work, views)
+
+
+def _preview_if_any(views: Sequence[ViewInput], rig: Rig, s: Settings) -> Surface | None:
+    try:
+        return preview(views, rig, s)
+    except EmptyResultError:  # the fine scan may still keep points, or says why not
+        return None
 
 
 VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud
 
 
-def _check_memory(views: Sequence[ViewInput], rig: Rig) -> None:
-    """Raise ResourceError if the machine has too little memory left for a scan of these views."""
+def _check_memory(views: Sequence[ViewInput], rig: Rig, at_once: bool) -> None:
+    """Raise ResourceError if the machine has too little memory left for a scan of these views; `at_once`: all their
+    frames are held.
+    """
     free = memory.available()
     if free is None or not views:
         return
@@ -359,7 +434,11 @@ def _check_memory(views: Sequence[ViewInput], rig: Rig) -> None:
     pixels = [lens.width * lens.height for lens in lenses]
     unread = [0 if isinstance(v.frames, list | tuple) else len(v.plan.keys) * v.plan.pixel_format.dtype.itemsize
               for v in views]  # fmt: skip
-    need = max(n * (VIEW_BYTES + u) for n, u in zip(pixels, unread, strict=True))
+    frames = [n * u for n, u in zip(pixels, unread, strict=True)]
+    if at_once:
+        need = max(n * VIEW_BYTES for n in pixels) + sum(frames)
+    else:
+        need = max(n * VIEW_BYTES + f for n, f in zip(pixels, frames, strict=True))
     need += sum(pixels) * (KEPT_BYTES + CLOUD_BYTES)
     if need > free:
         raise ResourceError(

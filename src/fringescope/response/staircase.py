@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import minimize_scalar
 
 from fringescope.errors import CaptureError, EmptyResultError, UsageError
 from fringescope.response import model
@@ -99,6 +97,8 @@ def _shape(c: F64, there: Bool) -> F64:
 
 def _harmonics(x: F64, f: F64) -> F64:
     """h_2 .. of fringes drawn from the darkest to the brightest level of the staircase."""
+    from scipy.interpolate import PchipInterpolator  # slow to import: scans do without it
+
     at, first = np.unique(x, return_inverse=True)
     mean = np.bincount(first, f) / np.bincount(first)
     a = model.expand(PchipInterpolator(at, mean)(at[0] + (at[-1] - at[0]) * model.nodes()))
@@ -107,6 +107,7 @@ def _harmonics(x: F64, f: F64) -> F64:
 
 def _gamma(x: F64, f: F64) -> float:
     """Exponent of the power law that, with any scale and offset, comes closest."""
+    from scipy.optimize import minimize_scalar
 
     def misfit(gamma: float) -> float:
         A = np.column_stack([np.ones_like(x), x**gamma])
