@@ -76,7 +76,7 @@ def compile_kernels(every_plan: bool = False) -> int:
     views = _views(rig, PixelFormat.BAYER_RG8)
     s = Settings(mesh=MeshSettings(preview_pixels=1000))  # thinned, too
     scan = pipeline.scan(views, rig, s, all_points=True, first=lambda _surface: None)
-    nearer = replace(scan.grids[0], xyz=scan.grids[0].xyz + np.float32([0, 0, 3]))
+    nearer = replace(scan.grids[0], xyz=scan.grids[0].xyz + np.array([0, 0, 3], np.float32))
     denoise.agree((nearer, *scan.grids[1:]), rig, s.denoise)  # views that disagree
     if scan.surface is not None:
         report.render_surface(scan.surface, size=(64, 48))
