@@ -467,7 +467,7 @@ def test_cross_examination_equals_its_twin(seed):
         for x, s, c in ((xyz, own.sigma, r.cameras[0]), (other.xyz, other.sigma, camera))
     )
     bad, lost = np.zeros(own.sigma.shape, np.uint8), np.zeros(len(own.sigma), np.int64)
-    views.contradicted(mine, (others,), 6.0, 0.5, bad, lost)
+    views.contradicted(mine, (others,), 6.0, 0.5, np.ones((1, 3, 3), np.bool_), bad, lost)
     said = np.zeros(own.sigma.shape, int)
     for i, j in np.argwhere(np.isfinite(xyz[..., 0])):
         said[i, j] = views.examine(*map(float, xyz[i, j]), float(own.sigma[i, j]), others, 6.0, 0.5)

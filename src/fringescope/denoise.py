@@ -290,12 +290,17 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool
     A grid that loses nothing comes back as it is; one that loses points is copied, or with `in_place` written to.
     """
     sights = [_sight(g, rig) for g in grids]
+    planes = [_planes(v, g, rig) for v, g in zip(sights, grids, strict=True)]
+    limits = float(s.agree_sigma), float(s.agree_slack)
     found = []
-    for g, own in zip(grids, sights, strict=True):
-        others = [v for v, o in zip(sights, grids, strict=True) if o.view != g.view]
+    for i, g in enumerate(grids):
+        others = [n for n, o in enumerate(grids) if o.view != g.view]
         bad, lost = np.zeros(g.reasons.shape, np.uint8), np.zeros(len(g.reasons), np.int64)
         if others:
-            views.contradicted(own, tuple(others), float(s.agree_sigma), float(s.agree_slack), bad, lost)
+            asked = np.empty((len(others), *planes[i].shape[:2]), np.bool_)
+            for n, some in zip(others, asked, strict=True):
+                views.doubtful(sights[i], planes[i], sights[n], planes[n], *limits, some)
+            views.contradicted(sights[i], tuple(sights[n] for n in others), *limits, asked, bad, lost)
         found.append((bad, lost))
     out = []
     for g, (bad, lost) in zip(grids, found, strict=True):  # all are judged before any loses a point
@@ -315,6 +320,12 @@ def _sight(grid: Grid, rig: Rig) -> views.View:
     xyz, sigma = views.constant(grid.xyz), views.constant(grid.sigma)
     return views.View(xyz.reshape(-1), sigma.reshape(-1), H, W, geometry.pose_vector(camera.pose),
                       geometry.lens_vector(camera.lens))
+
+
+def _planes(sight: views.View, grid: Grid, rig: Rig) -> F32:
+    out: F32 = memory.empty((*calm.shape_of(grid.reasons.shape), 16), np.float32)
+    views.planes(sight, geometry.centre(rig.cameras[grid.view].pose), out)
+    return out
 
 
 def interpolated(decoded: Decoded, pixel_format: PixelFormat) -> bool:
