@@ -233,7 +233,8 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
                     seen, pictures[i])
         colours.fill_gaps(marks[i], fusing.BLENDED, around, fusing.TILE, sides[i].rgb, sides[i].gain, SRGB, LIGHT,
                          pictures[i])
-    return Fused(Cloud(xyz, normal, rgb, sigma, _views(grids, owned)), seen, tuple(grids), tuple(marks), tuple(pictures),
+    view = _views(grids, owned)
+    return Fused(Cloud(xyz, normal, rgb, sigma, view), seen, tuple(grids), tuple(marks), tuple(pictures),
                  tuple(spacings), gains)
 
 

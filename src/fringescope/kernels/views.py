@@ -91,12 +91,13 @@ def nearest(U, V, D, height, width, edge, n, row, column):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touch(row, column, width, xyz, n):
+def _touch(row, column, width, xyz, sigma, n):
     """Reads every fourth of the pixels that will be needed, whose lines then come to the caches side by side."""
     some = _ZERO
     for k in range(0, n, 4):
         if row[k] >= 0:
-            some += xyz[np.uintp(3 * (row[k] * width + column[k]))]
+            p = np.uintp(row[k] * width + column[k])
+            some += xyz[p + p + p] + sigma[p]
     return some
 
 
@@ -404,7 +405,7 @@ def contradicted(first, last, own, others, tolerance, slack, asked, bad, lost):
                 _gather(own, i, columns, n, X, Y, Z, sigma)
                 project(X, Y, Z, other.pose, other.lens, n, U, V, D)
                 nearest(U, V, D, other.height, other.width, EDGE, n, row, column)
-                touched += _touch(row, column, other.width, other.xyz, n)
+                touched += _touch(row, column, other.width, other.xyz, other.sigma, n)
                 pick(row, column, other.width, other.xyz, n, A, B, C)
                 _noise(row, column, other.width, other.sigma, n, S)
                 _suspects(D, A, B, C, sigma, S, other.pose, _f(tolerance), footprint, n, ask)
