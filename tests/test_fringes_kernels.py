@@ -467,7 +467,7 @@ def test_cross_examination_equals_its_twin(seed):
         for x, s, c in ((xyz, own.sigma, r.cameras[0]), (other.xyz, other.sigma, camera))
     )
     bad, lost = np.zeros(own.sigma.shape, np.uint8), np.zeros(len(own.sigma), np.int64)
-    views.contradicted(mine, (others,), 1, 6.0, 0.5, bad, lost)
+    views.contradicted(mine, (others,), 1, 6.0, 0.5, np.ones((1, 3, 3), np.bool_), bad, lost)
     said = np.zeros(own.sigma.shape, int)
     for i, j in np.argwhere(np.isfinite(xyz[..., 0])):
         said[i, j] = views.examine(*map(float, xyz[i, j]), float(own.sigma[i, j]), others, 6.0, 0.5)
@@ -480,6 +480,82 @@ def test_cross_examination_equals_its_twin(seed):
     np.testing.assert_array_equal(bad != 0, want == -1)
     np.testing.assert_array_equal(lost, bad.sum(1))
     assert {-1, 0, 1} <= set(want.ravel())
+
+
+def looks_of(r, grids):
+    """Grids as `kernels.views` takes them, and their planes."""
+    looks, planes = [], []
+    for g in grids:
+        c = r.cameras[g.view]
+        pose, lens = geometry.pose_vector(c.pose), geometry.lens_vector(c.lens)
+        looks.append(views.View(g.xyz.reshape(-1), g.sigma.reshape(-1), *g.sigma.shape, pose, lens))
+        planes.append(np.full((*calm.shape_of(g.sigma.shape), 16), 7.0, np.float32))
+        views.planes(looks[-1], geometry.centre(c.pose), planes[-1])
+    return looks, planes
+
+
+@settings(max_examples=8, deadline=None)
+@given(seeds)
+def test_planes_of_tiles_hold_their_points(seed):
+    rng = np.random.default_rng(seed)
+    r = scenes.rig(1, 44, 35)
+    g = scenes.grid(r, 0, scenes.ball(), 0.01, rng, keep=lambda p, *_: rng.random(p.shape[:2]) > 0.01)
+    (_, (found,)) = looks_of(r, [g])
+    eye, kinds = geometry.centre(r.cameras[0].pose), set()
+    for t, u in np.ndindex(*found.shape[:2]):
+        p = g.xyz[8 * t : 8 * t + 8, 8 * u : 8 * u + 8].astype(float)
+        sigma, got = g.sigma[8 * t : 8 * t + 8, 8 * u : 8 * u + 8], found[t, u].astype(float)
+        whole, some = p.shape == (8, 8, 3) and np.isfinite(p).all(), np.isfinite(p[..., 0]).any()
+        kinds.add((whole, some))
+        assert np.isnan(got[9]) != whole
+        assert np.isnan(got[0]) != some
+        if not whole:
+            continue
+        middle = p.mean((0, 1))
+        a, b = ((p[:, 4:] - p[:, :4]).mean((0, 1)) * 3.5 / 4, (p[4:] - p[:4]).mean((0, 1)) * 3.5 / 4)
+        np.testing.assert_allclose(got[:9], np.concatenate([middle, a, b]), atol=2e-4)
+        n = np.cross(got[3:6], got[6:9])
+        n *= np.sign(n @ (eye - middle)) / np.linalg.norm(n)
+        np.testing.assert_allclose(got[9:12], n, atol=1e-4)
+        y, x = (np.mgrid[:8, :8] - 3.5) / 3.5
+        away = p - (got[:3] + x[..., None] * got[3:6] + y[..., None] * got[6:9])
+        s = away @ got[9:12]
+        want = [s.min(), s.max(), np.linalg.norm(away, axis=-1).max(), sigma.min()]
+        np.testing.assert_allclose(got[12:], want, atol=1e-5)
+    assert {(True, True), (False, True)} <= kinds
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_no_denied_point_hides_in_a_tile_that_is_not_looked_at(seed):
+    """Balls and plates, steps, points that fly by little and by much, views that are off against each other."""
+    rng = np.random.default_rng(seed)
+    r = scenes.rig(3, 160, 120, float(rng.uniform(5, 40)))
+    hit = scenes.ball(float(rng.uniform(4, 9))) if rng.random() < 0.5 else scenes.plane(rng.normal([0, 0, 1], 0.3))
+    found = [scenes.grid(r, i, hit, 0.01, rng) for i in range(3)]
+    for g in found:
+        ray = geometry.centre(r.cameras[g.view].pose) - g.xyz
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        g.xyz[:] += ray * np.float32(rng.normal(0, 0.08))
+        g.xyz[:] += ray * np.where(rng.random(g.sigma.shape) < 1e-3, rng.exponential(0.3, g.sigma.shape), 0)[..., None]
+        row, column = rng.integers(0, 100, 2)
+        g.xyz[row : row + 20, column : column + 13] += ray[row : row + 20, column : column + 13] * np.float32(0.2)
+    looks, planes = looks_of(r, found)
+    limits, shape, skipped = (6.0, 0.5), found[0].sigma.shape, 0
+    for i in range(3):
+        others = [n for n in range(3) if n != i]
+        asked = np.ones((2, *planes[i].shape[:2]), np.bool_)
+        said = []
+        for some in (True, False):
+            if not some:
+                for k, n in enumerate(others):
+                    views.doubtful(looks[i], planes[i], looks[n], planes[n], *limits, asked[k])
+            bad, lost = np.zeros(shape, np.uint8), np.zeros(len(found[i].sigma), np.int64)
+            views.contradicted(looks[i], tuple(looks[n] for n in others), len(others), *limits, asked, bad, lost)
+            said.append(bad)
+        np.testing.assert_array_equal(*said)
+        skipped += int((~asked & np.isfinite(planes[i][..., 0])).sum())
+    assert skipped > 0
 
 
 def test_noise_without_shot_noise_survives_a_blown_pixel():

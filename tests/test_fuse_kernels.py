@@ -94,6 +94,18 @@ def test_blend_equals_its_twin(seed):
         np.testing.assert_allclose(scratch[2:5, k], want, rtol=2e-4, atol=1e-6)
 
 
+def test_places_in_the_raster_are_those_of_the_projection():
+    rng = np.random.default_rng(4)
+    xyz = rng.normal([1, 2, 300], [20, 20, 5], (50, 3)).astype(np.float32)
+    raster = np.concatenate([np.eye(3).ravel(), [0.5, 0.2, 10.0], [-0.05, -0.04], [1 / 0.01]])
+    ab, cell = np.empty((50, 2)), np.empty(50, np.int64)
+    ownership.place(xyz, raster, 9, 12, ab, cell)
+    q = xyz.astype(float) + np.array([0.5, 0.2, 10.0])
+    np.testing.assert_allclose(ab, q[:, :2] / q[:, 2:], rtol=1e-12)
+    at = np.clip(((ab - np.array([-0.05, -0.04])) / 0.01).astype(int), 0, [11, 8])
+    np.testing.assert_array_equal(cell, at @ [1, 12])
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_doubles_equal_brute_force(seed):

@@ -293,14 +293,19 @@ def agree(grids: Sequence[Grid], rig: Rig, s: DenoiseSettings, *, in_place: bool
     A grid that loses nothing comes back as it is; one that loses points is copied, or with `in_place` written to.
     """
     sights = [_sight(g, rig) for g in grids]
+    planes = [_planes(v, g, rig) for v, g in zip(sights, grids, strict=True)]
+    limits = float(s.agree_sigma), float(s.agree_slack)
     found = []
-    for g, own in zip(grids, sights, strict=True):
-        others = [v for v, o in zip(sights, grids, strict=True) if o.view != g.view]
+    for i, g in enumerate(grids):
+        others = [n for n, o in enumerate(grids) if o.view != g.view]
         bad, lost = np.zeros(g.reasons.shape, np.uint8), np.zeros(len(g.reasons), np.int64)
         if others:
+            asked = np.empty((len(others), *planes[i].shape[:2]), np.bool_)
+            for n, some in zip(others, asked, strict=True):
+                views.doubtful(sights[i], planes[i], sights[n], planes[n], *limits, some)
             n = len(others)
-            filled = tuple(others[min(i, n - 1)] for i in range(max(MOST, n)))  # one kernel for any number
-            views.contradicted(own, filled, n, float(s.agree_sigma), float(s.agree_slack), bad, lost)
+            filled = tuple(sights[others[min(k, n - 1)]] for k in range(max(MOST, n)))  # one kernel for any number
+            views.contradicted(sights[i], filled, n, *limits, asked, bad, lost)
         found.append((bad, lost))
     out = []
     for g, (bad, lost) in zip(grids, found, strict=True):  # all are judged before any loses a point
@@ -320,6 +325,12 @@ def _sight(grid: Grid, rig: Rig) -> views.View:
     xyz, sigma = views.constant(grid.xyz), views.constant(grid.sigma)
     return views.View(xyz.reshape(-1), sigma.reshape(-1), H, W, geometry.pose_vector(camera.pose),
                       geometry.lens_vector(camera.lens))
+
+
+def _planes(sight: views.View, grid: Grid, rig: Rig) -> F32:
+    out: F32 = memory.empty((*calm.shape_of(grid.reasons.shape), 16), np.float32)
+    views.planes(sight, geometry.centre(rig.cameras[grid.view].pose), out)
+    return out
 
 
 def interpolated(decoded: Decoded, pixel_format: PixelFormat) -> bool:

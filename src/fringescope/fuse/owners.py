@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fringescope import geometry
+from fringescope import geometry, memory
 from fringescope.kernels import fusing
 from fringescope.kernels import ownership as k
 from fringescope.settings import FuseSettings
@@ -106,11 +106,10 @@ def drop_doubles(xyz: F32, normal: F32, view: AnyArray, raster: Raster, s: FuseS
     """Which points (n,) near borders lie within the separation of another view's point that stays."""
     if not len(xyz):
         return np.zeros(0, np.bool_)
-    q = geometry.transform(raster.pose, xyz)
-    ab = q[:, :2] / q[:, 2:]
     rows, cols = raster.shape
-    index = np.clip(((ab - raster.low) / raster.cell).astype(np.int64), 0, [cols - 1, rows - 1]) @ [1, cols]
-    start, order = np.zeros(rows * cols + 2, np.int32), np.empty(len(index), np.int64)
+    ab, index = memory.empty((len(xyz), 2), np.float64), memory.empty((len(xyz),), np.int64)
+    k.place(xyz, raster.vector, rows, cols, ab, index)
+    start, order = np.zeros(rows * cols + 2, np.int32), memory.empty((len(index),), np.int64)
     k.sort_cells(index, start, order)
     out = np.zeros(len(index), np.bool_)
     k.doubles(ab, xyz, normal, view, raster.separation, 1.05 * s.separation_mm, 3 * raster.cell * raster.depth, index,

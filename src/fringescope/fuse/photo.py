@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from fringescope import geometry
+from fringescope import geometry, memory
 from fringescope.errors import CaptureError
 from fringescope.kernels import colour as k
 from fringescope.kernels.views import constant
@@ -51,7 +51,7 @@ def _samples(raw: AnyArray, pixel_format: PixelFormat, camera: str) -> AnyArray:
 def _light(samples: AnyArray, pixel_format: PixelFormat, s: FuseSettings) -> F32:
     """Codes (H, W, 3 or 1) to linear light (H, W, 3), 0..1 of full scale, white-balanced."""
     white = [s.white_red, 1.0, s.white_blue] if pixel_format.is_colour else [1.0, 1.0, 1.0]
-    out = np.empty((*samples.shape[:2], 3), np.float32)
+    out = memory.empty((*samples.shape[:2], 3), np.float32)
     k.scale(constant(samples), (np.array(white) / pixel_format.max_value).astype(np.float32), out)
     return out
 
@@ -66,7 +66,7 @@ def photo(raw: AnyArray, pixel_format: PixelFormat, camera: str, s: FuseSettings
     """
     s = s or FuseSettings()
     rgb = _light(_samples(raw, pixel_format, camera), pixel_format, s)
-    full = np.empty(raw.shape[:2], np.bool_)
+    full = memory.empty(raw.shape[:2], np.bool_)
     k.full(constant(raw if raw.ndim == 3 else raw[:, :, None]), pixel_format.max_value,
            1 if pixel_format.is_bayer else 0, full)
     return Photo(camera, rgb, full)
@@ -78,7 +78,7 @@ def photo_from_background(background: F32, pixel_format: PixelFormat, camera: st
 
     It shows the specimen under the projector's light. A Bayer camera's background is a mosaic like its frames.
     """
-    codes, bright = np.empty(background.shape, np.uint16), np.empty(background.shape, np.bool_)
+    codes, bright = memory.empty(background.shape, np.uint16), memory.empty(background.shape, np.bool_)
     k.share_codes(constant(background), np.float32(1.0 / pixel_format.full_scale), np.float32(0.99), codes, bright)
     like = PixelFormat.BAYER_RG16 if pixel_format.is_bayer else PixelFormat.MONO16
     return Photo(camera, _light(_samples(codes, like, camera), like, s or FuseSettings()), bright)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fringescope import geometry
+from fringescope import geometry, memory
 from fringescope.errors import EmptyResultError, RigError
 from fringescope.fuse.owners import Raster, bits_of, drop_doubles, raster_of, settle_owners
 from fringescope.fuse.photo import LIGHT, SRGB, is_grey, view_gains
@@ -78,7 +78,7 @@ def normals(grid: Grid, rig: Rig, s: FuseSettings | None = None) -> F32:
     """
     s = s or FuseSettings()
     camera = rig.cameras[grid.view]
-    out = np.empty(grid.xyz.shape, np.float32)
+    out = memory.empty(grid.xyz.shape, np.float32)
     k.normals(*_points(grid), geometry.centre(camera.pose), _angle(camera), s.normal_radius, s.max_slope, s.jump_sigma,
               out)
     return out
@@ -135,16 +135,16 @@ def _side(grid: Grid, photo: Photo, gain: F64, share: float, spacing: float, ras
     hole = max(1.0, 0.5 * s.hole_mm / spacing) if spacing > 0 else 1.0
     width = s.blend_mm / spacing if spacing > 0 else 1.0
     step = max(1, int(min(0.5 * hole, width / 20)))  # what rises over hundreds of pixels needs no value in each
-    squares, code = np.zeros((-(-H // step), -(-W // step)), np.uint8), np.empty((H, 2 * W), np.int16)
+    squares, code = np.zeros((-(-H // step), -(-W // step)), np.uint8), memory.empty((H, 2 * W), np.int16)
     centre = geometry.centre(camera.pose)
     k.survey(*_points(grid), centre, _angle(camera), s.normal_radius, s.max_slope, s.jump_sigma, squares, step,
              raster.vector, code, there)
     whole = _close((squares & k.SOME) != 0, hole / step) & ((squares & k.TORN) == 0)
-    rise = np.empty((H, W), np.uint8)
+    rise = memory.empty((H, W), np.uint8)
     colours.spread(rise, np.pad(_rise(whole, width / step), 1, mode="edge"), step)
     clear = np.zeros(1, np.uint8)
     if photo.saturated.any():
-        clear = np.empty((H, W), np.uint8)
+        clear = memory.empty((H, W), np.uint8)
         colours.clearness(constant(photo.saturated), s.highlight_pixels, clear)
     return fusing.Side(
         constant(grid.xyz).reshape(-1), constant(grid.sigma).reshape(-1), constant(code).reshape(-1),
@@ -170,7 +170,17 @@ def _starts(counts: Sequence[AnyArray]) -> list[AnyArray]:
 
 
 def _room(n: int) -> tuple[F32, F32, F32]:
-    return np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    return memory.empty((n, 3), np.float32), memory.empty((n, 3), np.float32), memory.empty((n,), np.float32)
+
+
+def _views(grids: Sequence[Grid], counts: Sequence[AnyArray]) -> U8:
+    """The view of each point, of so many in each row of each view."""
+    out = memory.empty((sum(int(c.sum()) for c in counts),), np.uint8)
+    first = 0
+    for g, c in zip(grids, counts, strict=True):
+        out[first : first + int(c.sum())] = g.view
+        first += int(c.sum())
+    return out
 
 
 def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSettings | None = None) -> Fused:
@@ -195,7 +205,7 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     owner = settle_owners(sides, limits, raster, there)
     del there
     filled = tuple(sides[min(i, V - 1)] for i in range(MOST))  # always as many, so that one kernel does for any number
-    marks = [np.empty(g.sigma.shape, np.uint8) for g in grids]
+    marks = [memory.empty(g.sigma.shape, np.uint8) for g in grids]
     squares = [tuple(-(-n // fusing.TILE) for n in g.reasons.shape) for g in grids]
     near = [np.zeros(shape, np.uint8) for shape in squares]
     owned, close = ([np.empty(len(m), np.int64) for m in marks] for _ in range(2))
@@ -216,15 +226,15 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     starts = _starts(owned)
     n = int(starts[-1][-1])
     xyz, normal, sigma = _room(n)
-    rgb, seen = np.empty((n, 3), np.uint8), np.empty(n, np.uint8)
-    pictures = [np.empty((*m.shape, 3), np.uint8) for m in marks]
+    rgb, seen = memory.empty((n, 3), np.uint8), memory.empty((n,), np.uint8)
+    pictures = [memory.empty((*m.shape, 3), np.uint8) for m in marks]
     for i in range(V):
         around = cv2.dilate(near[i], np.ones((_NEAR, _NEAR), np.uint8))
         fusing.fuse(filled, V, i, limits, marks[i], fusing.OWNED, around, starts[i], SRGB, xyz, normal, sigma, rgb,
                     seen, pictures[i])
         colours.fill_gaps(marks[i], fusing.BLENDED, around, fusing.TILE, sides[i].rgb, sides[i].gain, SRGB, LIGHT,
                          pictures[i])
-    view = np.repeat(np.array([g.view for g in grids], np.uint8), [int(c.sum()) for c in owned])
+    view = _views(grids, owned)
     return Fused(Cloud(xyz, normal, rgb, sigma, view), seen, tuple(grids), tuple(marks), tuple(pictures),
                  tuple(spacings), gains)
 
@@ -249,12 +259,11 @@ def all_points(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: Fuse
     starts = _starts(counts)
     n = int(starts[-1][-1])
     xyz, normal, sigma = _room(n)
-    rgb = np.empty((n, 3), np.uint8)
+    rgb = memory.empty((n, 3), np.uint8)
     for i, (g, p) in enumerate(zip(grids, photos, strict=True)):
         colours.pack(constant(g.xyz), constant(g.sigma), normals(g, rig, s), constant(p.rgb),
                      gains[i].astype(np.float32), SRGB, starts[i], xyz, normal, sigma, rgb)
-    view = np.repeat(np.array([g.view for g in grids], np.uint8), [int(c.sum()) for c in counts])
-    return Cloud(xyz, normal, rgb, sigma, view)
+    return Cloud(xyz, normal, rgb, sigma, _views(grids, counts))
 
 
 def median_spacing(fused: Fused) -> float:

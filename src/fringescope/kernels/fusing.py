@@ -91,6 +91,7 @@ def _fetch(side, row, column, n, S, P, Q, rise, clear):
         else:
             S[k] = np.nan
             P[k] = Q[k] = rise[k] = _ZERO
+    for k in range(n):
         clear[k] = _ONE
     if bright:
         for k in range(n):
@@ -193,41 +194,32 @@ def _taps(U, V, ok, tint, clear, share, height, width, bit, n, place, fu, fv, we
         seen[k] |= bit if ok[k] else np.uint8(0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _corners(rgb, place, right, below, weight, n, T):
-    """Three colours of four pixels each: T (12, n)."""
-    a0, a1, a2, b0, b1, b2 = T[0], T[1], T[2], T[3], T[4], T[5]
-    c0, c1, c2, d0, d1, d2 = T[6], T[7], T[8], T[9], T[10], T[11]
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def _between(rgb, place, right, below, fu, fv, weight, gain, n, c0, c1, c2):
+    """Colours between four pixels each, bilinear, where they have a weight."""
     right, below = np.uintp(right), np.uintp(below)
+    g0, g1, g2 = gain[0], gain[1], gain[2]
     for k in range(n):
         if not weight[k] > _ZERO:
             continue
-        p = np.uintp(place[k])
-        a0[k], a1[k], a2[k] = rgb[p], rgb[p + _ADD1], rgb[p + _ADD2]
-        q = p + right
-        b0[k], b1[k], b2[k] = rgb[q], rgb[q + _ADD1], rgb[q + _ADD2]
-        p += below
-        c0[k], c1[k], c2[k] = rgb[p], rgb[p + _ADD1], rgb[p + _ADD2]
-        q = p + right
-        d0[k], d1[k], d2[k] = rgb[q], rgb[q + _ADD1], rgb[q + _ADD2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _bilinear(a, b, c, d, fu, fv, gain, n, out):
-    for k in range(n):
-        top, low = a[k] + fu[k] * (b[k] - a[k]), c[k] + fu[k] * (d[k] - c[k])
-        out[k] = (top + fv[k] * (low - top)) * gain
+        a = np.uintp(place[k])
+        b, c = a + right, a + below
+        d = c + right
+        x, y = fu[k], fv[k]
+        p0, p1, p2 = rgb[a], rgb[a + _ADD1], rgb[a + _ADD2]
+        q0, q1, q2 = rgb[c], rgb[c + _ADD1], rgb[c + _ADD2]
+        p0, p1, p2 = p0 + x * (rgb[b] - p0), p1 + x * (rgb[b + _ADD1] - p1), p2 + x * (rgb[b + _ADD2] - p2)
+        q0, q1, q2 = q0 + x * (rgb[d] - q0), q1 + x * (rgb[d + _ADD1] - q1), q2 + x * (rgb[d + _ADD2] - q2)
+        c0[k], c1[k], c2[k] = (p0 + y * (q0 - p0)) * g0, (p1 + y * (q1 - p1)) * g1, (p2 + y * (q2 - p2)) * g2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _colours(side, U, V, ok, tint, clear, bit, n, place, fu, fv, T, c0, c1, c2, weight, seen):
+def _colours(side, U, V, ok, tint, clear, bit, n, place, fu, fv, c0, c1, c2, weight, seen):
     """Colour of the other view at (U, V), bilinear, and its weight; what it sees is marked with `bit`."""
     W, H = side.width, side.height
     _taps(U, V, ok, tint, clear, side.share, H, W, bit, n, place, fu, fv, weight, seen)
-    _corners(side.rgb, place, 3 if W > 1 else 0, 3 * W if H > 1 else 0, weight, n, T)
-    _bilinear(T[0], T[3], T[6], T[9], fu, fv, side.gain[0], n, c0)
-    _bilinear(T[1], T[4], T[7], T[10], fu, fv, side.gain[1], n, c1)
-    _bilinear(T[2], T[5], T[8], T[11], fu, fv, side.gain[2], n, c2)
+    right, below = 3 if W > 1 else 0, 3 * W if H > 1 else 0
+    _between(side.rgb, place, right, below, fu, fv, weight, side.gain, n, c0, c1, c2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -370,8 +362,8 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
     rise, clear, cosine, tint = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     sigma_w, weight_w, along = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     C, code, green = np.empty((count, 4, BLOCK), f), np.empty(3 * BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    T, place, factors = np.empty((12, BLOCK), f), np.empty(BLOCK, np.int64), np.empty(3 * BLOCK, f)
-    T[:] = _ZERO
+    place, factors = np.empty(BLOCK, np.int64), np.empty(3 * BLOCK, f)
+    C[:] = _ZERO
     for k in range(3 * BLOCK):
         factors[k] = own.gain[k % 3]
     row, column, columns = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32), np.empty(BLOCK + 1, np.int32)
@@ -425,7 +417,7 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
                              weight_w, focal, limits, n, along, ok)
                     _add(ok, along, weight_w, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ)
                     if pictured:
-                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, place, along, cosine, T, C[slot, 0],
+                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, place, along, cosine, C[slot, 0],
                                  C[slot, 1], C[slot, 2], C[slot, 3], said)
                     slot += 1
                 if pictured:

@@ -82,7 +82,21 @@ def mark(first, last, flat, raster, owner, bits, tile, marks, owned, close, near
                     near[i // tile, left // tile] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@by_rows(lambda xyz, *_: xyz.shape[0])
+def place(first, last, xyz, raster, rows, cols, ab, cell):
+    """Ideal coordinates `ab` (n, 2) of points (n, 3), and the number of the `raster`'s cell (see `surface.locate`)."""
+    r, low_a, low_b, scale = raster, raster[12], raster[13], raster[14]
+    for k in range(first, last):
+        x, y, z = float(xyz[k, 0]), float(xyz[k, 1]), float(xyz[k, 2])
+        depth = r[6] * x + r[7] * y + r[8] * z + r[11]
+        a = (r[0] * x + r[1] * y + r[2] * z + r[9]) / depth
+        b = (r[3] * x + r[4] * y + r[5] * z + r[10]) / depth
+        ab[k, 0], ab[k, 1] = a, b
+        column = min(max(int((a - low_a) * scale), 0), cols - 1)
+        cell[k] = min(max(int((b - low_b) * scale), 0), rows - 1) * cols + column
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def sort_cells(cell, start, order):
     """Points (n,) sorted by `cell`: those of cell c are `order`[`start`[c] : `start`[c + 1]], in the order they came.
 
@@ -97,7 +111,7 @@ def sort_cells(cell, start, order):
         start[cell[k] + 1] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def doubles(ab, xyz, normal, view, reach, sideways, near, cell, rows, cols, start, order, out):
     """Which points (n,) lie too near a kept point of another view.
 
