@@ -42,13 +42,13 @@ def compiled_by(lines, *preview):
     return names[1:]
 
 
-@pytest.fixture(scope="module")
-def warm():
+@pytest.fixture(scope="module", autouse=True)
+def _warm():
     subprocess.run([sys.executable, "-m", "fringescope", "warmup"], check=True, capture_output=True)
 
 
 @pytest.mark.parametrize("preset", ["single", "pair", "five"])
-def test_a_simulated_capture_compiles_nothing(warm, tmp_path, preset):
+def test_a_simulated_capture_compiles_nothing(tmp_path, preset):
     capture, out = str(tmp_path / "capture"), str(tmp_path / "scan")
     simulate = [sys.executable, "-m", "fringescope", "simulate", "tissue-domed", "--out", capture]
     subprocess.run([*simulate, "--preset", preset, "--scale", "0.05"], check=True, capture_output=True)
@@ -58,7 +58,7 @@ def test_a_simulated_capture_compiles_nothing(warm, tmp_path, preset):
     assert compiled_by(lines, capture, rig) == []
 
 
-def test_rendered_tissue_compiles_nothing(warm, shared, tmp_path):
+def test_rendered_tissue_compiles_nothing(shared, tmp_path):
     folder = shared / "data" / "rendered-small"
     rig = folder / "truth" / "rig.json"
     line = ["reconstruct", str(folder / "tissue"), "--rig", str(rig), "--out", str(tmp_path / "scan"), "--json"]
