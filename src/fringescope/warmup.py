@@ -41,7 +41,7 @@ def drawn_view(rig: Rig, camera: Camera, plan: ViewPlan) -> ViewInput:
     lit = geometry.field_of_view(Rig(rig.projector, (camera,)), p)
 
     rng = np.random.default_rng(0)
-    lit &= (u // 9 + v // 9) % 2 + (u > L.width / 2) > 0  # a chessboard, which meets in corners
+    lit = lit & (((u // 9 + v // 9) % 2 == 1) | (u > L.width / 2))  # a chessboard, which meets in corners
 
     def frame(signal: AnyArray | float, dark: float) -> AnyArray:
         light = np.where(lit, signal, dark) + rng.normal(0, 1.5, u.shape)
@@ -77,7 +77,7 @@ def compile_kernels(every_plan: bool = False) -> int:
     views = _views(rig, PixelFormat.BAYER_RG8)
     s = Settings(mesh=MeshSettings(triangles=2000, preview_triangles=300, preview_pixels=20_000))  # simplified, thinned
     scan = pipeline.scan(views, rig, s, all_points=True, first=lambda _surface: None)
-    nearer = replace(scan.grids[0], xyz=scan.grids[0].xyz + np.float32([0, 0, 3]))
+    nearer = replace(scan.grids[0], xyz=scan.grids[0].xyz + np.array([0, 0, 3], np.float32))
     denoise.agree((nearer, *scan.grids[1:]), rig, s.denoise)  # views that disagree
     if scan.surface is not None:
         report.render_surface(scan.surface, size=(64, 48))
