@@ -42,12 +42,11 @@ def compiled_by(lines, *preview):
     return names[1:]
 
 
-@pytest.fixture(scope="module")
-def warm():
+@pytest.fixture(scope="module", autouse=True)
+def _warm():
     subprocess.run([sys.executable, "-m", "fringescope", "warmup"], check=True, capture_output=True)
 
 
-@pytest.mark.usefixtures("warm")
 @pytest.mark.parametrize("preset", ["single", "pair", "five"])
 def test_a_simulated_capture_compiles_nothing(tmp_path, preset):
     capture, out = str(tmp_path / "capture"), str(tmp_path / "scan")
@@ -59,7 +58,6 @@ def test_a_simulated_capture_compiles_nothing(tmp_path, preset):
     assert compiled_by(lines, capture, rig) == []
 
 
-@pytest.mark.usefixtures("warm")
 def test_rendered_tissue_compiles_nothing(shared, tmp_path):
     folder = shared / "data" / "rendered-small"
     rig = folder / "truth" / "rig.json"
