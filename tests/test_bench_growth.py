@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
+from fringescope import bench, cli
 from fringescope.bench import growth, plot
 from fringescope.types import FringeSet
 
@@ -52,3 +53,10 @@ def test_the_drawing_has_a_line_for_each_cost_in_each_panel():
     assert "cores, 5 megapixels" in words
     result["ns_per_pixel_by_cores"] = {}
     assert len([e for e in ET.fromstring(plot.drawing(result)).iter() if e.tag.endswith("circle")]) == 15
+
+
+def test_a_drawing_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(bench, "measure", lambda *_args, **_more: pytest.fail("it began"))
+    for where in (tmp_path, tmp_path / "none" / "growth.svg"):
+        assert cli.run(["bench", "--plot", str(where)]) == 1
+        assert "needed a file in a folder that exists" in capsys.readouterr().err

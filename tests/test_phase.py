@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from fringescope import geometry, phase
 from fringescope.errors import CaptureError, DecodeError
+from fringescope.phase import noise
 from fringescope.settings import PhaseSettings
 from fringescope.types import FrameKey, FringeSet, GraySet, NoiseModel, PixelFormat, Reason, Rig, Role, Volume
 from tests import core_scenes as core
@@ -459,3 +461,10 @@ def test_bounds_hold_every_phase_in_the_volume(rng):
         assert (phi > np.min([c[0] for c in corners], 0)).all()
         assert (phi < np.max([c[1] for c in corners], 0)).all()
         assert np.ptp(phi) > 0.5 * (bounds[1].max() - bounds[0].min())  # and they are no wider than need be
+
+
+@pytest.mark.parametrize("dof", [1, 2, 5, 13, 61])
+def test_truncated_chi_squared_as_scipy_has_it(dof):
+    few, most = (float(chi2.ppf(q, dof)) for q in (0.8, 0.998))
+    want = chi2.cdf(few, dof + 2) / 0.8, most / dof, chi2.cdf(most, dof + 2) / 0.998
+    np.testing.assert_allclose(noise._truncation(dof), want, rtol=1e-10)

@@ -124,12 +124,6 @@ class Domains:
         if (self.sizes < least).any():
             k.mark_small(self.node, self.label, self.kind, self.sizes, least, bit, reasons)
 
-    def labels(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """The domain (H, W) of every pixel, -1 = masked."""
-        out = np.empty(shape, np.int32)
-        k.spread(self.node, self.label, self.kind, out)
-        return out
-
 
 def domains(
     phase: F32, sigma: F32, reasons: U16, field: F64, limits: tuple[float, float, float], steps: F32, least_step: float

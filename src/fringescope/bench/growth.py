@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fringescope.bench.frames import views_of
+from fringescope.errors import FringescopeError
 from fringescope.types import Rig, ViewInput
 
 SIZES = (0.25, 1.0, 5.0, 20.0, 80.0)  #: megapixels
@@ -55,7 +56,7 @@ print(json.dumps(bench.one_view_of(float(sys.argv[2]), int(sys.argv[3]))))
 
 def cores(repeat: int, tell: Tell) -> dict[str, dict[str, float]]:
     """Nanoseconds a pixel on 1, 2, 4 .. of the cores that there are, each in a process of its own; {} if it cannot be
-    said on which cores a process runs.
+    said on which cores a process runs. Raises FringescopeError if such a process fails.
     """
     if not hasattr(os, "sched_setaffinity"):
         return {}
@@ -66,7 +67,8 @@ def cores(repeat: int, tell: Tell) -> dict[str, dict[str, float]]:
         command = [sys.executable, "-c", _ALONE, str(n), str(FEW), str(repeat)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise RuntimeError(done.stderr.strip().splitlines()[-1])
+            said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            raise FringescopeError(f"the run on {n} of {there} cores ended with status {done.returncode}: {said}")
         times: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
         out[str(n)] = {name: 1e3 * t / FEW for name, t in times.items()}
     return out

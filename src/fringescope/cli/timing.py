@@ -9,6 +9,7 @@ import typer
 
 from fringescope.cli.app import app
 from fringescope.cli.common import Json, Progress, emit
+from fringescope.errors import OutputError
 
 
 @app.command()
@@ -28,16 +29,21 @@ def bench(
     """Times a scan against a plain copy of the same memory and against other decoders, all in one run."""
     from fringescope import bench as benchmark
 
+    if plot is not None and (plot.is_dir() or not plot.parent.is_dir()):
+        raise OutputError(f"--plot {plot}: needed a file in a folder that exists; make the folder first")
     with Progress() as progress:
         result = benchmark.measure(
             megapixels, repeat, growth=growth or plot is not None, whole=whole, peer_python=peer_python,
             tell=progress.share,
         )  # fmt: skip
+    emit(result, json, benchmark.lines(result))
     if plot is not None:
         from fringescope.bench.plot import drawing
 
-        plot.write_text(drawing(result), encoding="utf-8")
-    emit(result, json, benchmark.lines(result))
+        try:
+            plot.write_text(drawing(result), encoding="utf-8")
+        except OSError as e:
+            raise OutputError(f"--plot {plot}: cannot be written: {e.strerror}") from e
 
 
 @app.command()

@@ -14,7 +14,7 @@ from fringescope.kernels.sinusoid import follow, left_over
 BLOCK = 512  #: pixels of a row that are worked on together
 
 _f = np.float32
-_ZERO, _HALF, _ONE, _TWO = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0))
+_ZERO, _ONE, _TWO = (np.float32(c) for c in (0.0, 1.0, 2.0))
 _INF = np.float32(np.inf)
 _NAN = np.float32(np.nan)
 _P, _Q, _S = BLOCK, 2 * BLOCK, 3 * BLOCK  # where the sums of I cos, I sin and squared residuals lie in their scratch

@@ -179,11 +179,3 @@ def mark_small(node, label, kind, sizes, least, bit, reasons):
                     own = label_of(node, label, kind, i, j)
                     if own >= 0 and sizes[own] < least and reasons[i, j] == 0:
                         reasons[i, j] = bit
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def spread(node, label, kind, out):
-    """The label of every pixel, into `out` (H, W)."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = label_of(node, label, kind, i, j)

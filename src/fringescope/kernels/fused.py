@@ -39,10 +39,9 @@ from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
 
 _f = np.float32
-_ZERO, _HALF, _ONE, _TWO = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0))
+_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
 _INF = np.float32(np.inf)
 _NAN = np.float32(np.nan)
-_CONTRACT = {"contract"}
 
 
 class Sets(NamedTuple):

@@ -20,7 +20,7 @@ OWNED, EDGE, POINT, BLENDED = 1, 2, 4, 8  #: bits of a view's marks
 TILE = 32  #: side, in pixels, of the squares of a picture that are blended or not
 
 _f = np.float32
-_ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0, 3.0))
+_ZERO, _ONE, _TWO, _THREE = (np.float32(c) for c in (0.0, 1.0, 2.0, 3.0))
 _ADD1, _ADD2 = np.uintp(1), np.uintp(2)  # to indices, which are quicker without a sign
 _CONTRACT = {"contract"}
 
