@@ -35,6 +35,12 @@ def test_scan_in_one_call(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "surface.glb").read_bytes().startswith(b"glTF")
 
 
+def test_scan_while_it_records(tmp_path: Path) -> None:
+    said = run("05_scan_while_it_records.py", str(tmp_path / "out"), "0.04")
+    assert re.match(r"coarse surface: \d+ triangles\n\d+ points in ", said)
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"coarse.glb", "cloud.ply", "surface.glb"}
+
+
 def test_the_parts_take_away_and_never_add() -> None:
     left = [int(n) for n in re.findall(r"leaves (\d+) of", run("02_the_parts.py", "0.04"))]
     assert len(left) == 5

@@ -16,11 +16,13 @@ import subprocess
 import sys
 import tempfile
 import tracemalloc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, sleep
 from typing import Any
 
 import cv2
@@ -32,8 +34,9 @@ from fringescope.bench.frames import views_of
 from fringescope.bench.peers import median_time
 from fringescope.errors import UsageError
 from fringescope.settings import Settings
-from fringescope.types import AnyArray, FringeSet, Rig, ViewInput
+from fringescope.types import AnyArray, FrameKey, FringeSet, Rig, ViewInput
 
+PERIOD_S = 0.04  #: from one frame to the next where they arrive: 25 a second
 BYTES_OUT = 17  #: xyz, sigma, reason of a pixel
 PEERS = Path(__file__).with_name("peers.py")
 
@@ -63,6 +66,8 @@ def measure(
     tell("three views", 0.5)
     floor_three = copy_floor(views, max(repeat, 9))
     three = median_time(lambda: [pipeline.scan_view(v, rig, s) for v in views], max(1, repeat // 2))
+    tell("three views as they arrive", 0.57)
+    late = _after_last(rig, views, s, max(1, repeat // 2))
     tell("memory", 0.6)
     io, peak = _memory(rig, views[0], s)
     tell("other decoders", 0.65)
@@ -83,6 +88,8 @@ def measure(
         "one_view_over_copy": one["one_view"] / one["copy_floor"],
         "three_views_over_copy": three / floor_three,
         "three_views_s": three,
+        "after_last_frame_s": late,
+        "after_last_frame_over_three_views": late / three,
         "peak_memory_over_io": peak / io,
         "fringes_fast_over_ours": fast / ours if isinstance(fast, float) else None,
         "seconds": one,
@@ -97,6 +104,11 @@ def measure(
         start = perf_counter()
         pipeline.scan(views, rig, s)
         out["surface_s"] = perf_counter() - start
+        tell("three views to a surface as they arrive", 0.85)
+        clock, shown = _Clock(), []
+        pipeline.scan(clock.paced(views), rig, s, first=lambda _: shown.append(clock.since_last()))
+        out["coarse_surface_after_last_frame_s"] = shown[0] if shown else None
+        out["surface_after_last_frame_s"] = clock.since_last()
     if growth:
         del views
 
@@ -119,6 +131,8 @@ def lines(result: dict[str, Any]) -> list[str]:
         out.append(f"  {name.replace('_', ' '):24} {t / floor:8.1f} x copy {t * 1e3:10.1f} ms")
     three = result["three_views_s"]
     out.append(f"  {'three views':24} {result['three_views_over_copy']:8.1f} x copy {three * 1e3:10.1f} ms")
+    late = result["after_last_frame_s"]
+    out.append(f"  {'... after the last frame':24} {late / three:8.2f} x three views {late * 1e3:7.1f} ms")
     out.append(f"  {'peak memory':24} {result['peak_memory_over_io']:8.2f} x input and output")
     for name, t in result["others_s"].items():
         if isinstance(t, float):
@@ -128,11 +142,49 @@ def lines(result: dict[str, Any]) -> list[str]:
     if "surface_s" in result:
         out.append(f"  {'... a coarse surface first':24} {'':15} {result['coarse_surface_s'] * 1e3:10.1f} ms")
         out.append(f"  {'three views to a surface':24} {'':15} {result['surface_s'] * 1e3:10.1f} ms")
+        for name in ("coarse_surface", "surface"):
+            t = result[f"{name}_after_last_frame_s"]
+            if t is not None:
+                out.append(f"  ... {name.replace('_', ' ')} after the last frame {t * 1e3:12.1f} ms")
     for key, what in (("", "megapixels"), ("_by_frames", "frames"), ("_by_cores", "cores")):
         for size, one in result.get("ns_per_pixel" + key, {}).items():
             each = ", ".join(f"{name.replace('_', ' ')} {t:.1f}" for name, t in one.items())
             out.append(f"  {size:>5} {what}, ns a pixel: {each}")
     return out
+
+
+class _Clock:
+    """Frames that come one by one, as a camera sends them, and the time since the last."""
+
+    def __init__(self) -> None:
+        self._last = 0.0
+
+    def paced(self, views: Sequence[ViewInput]) -> list[ViewInput]:
+        """The views, each frame `PERIOD_S` after the one before."""
+
+        def frames(view: ViewInput) -> Iterator[tuple[FrameKey, AnyArray]]:
+            for one in view.frames:
+                sleep(PERIOD_S)
+                self._last = perf_counter()
+                yield one
+
+        return [replace(view, frames=frames(view)) for view in views]
+
+    def since_last(self) -> float:
+        """Seconds since a frame came."""
+        return perf_counter() - self._last
+
+
+def _after_last(rig: Rig, views: Sequence[ViewInput], s: Settings, repeat: int) -> float:
+    """Seconds from the last frame to the masked points of all views, whose frames arrive view after view."""
+    out = []
+    for _ in range(repeat):
+        clock = _Clock()
+        arriving, work = clock.paced(views), partial(pipeline.scan_view, rig=rig, s=s)
+        with pipeline.arrival.each(work, arriving, rig, at_once=False) as made:
+            list(made)
+        out.append(clock.since_last())
+    return float(np.median(out))
 
 
 def copy_floor(views: Sequence[ViewInput], repeat: int) -> float:

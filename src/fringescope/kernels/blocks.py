@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from fringescope.kernels.pixel import fitted, judged, of_eight, of_four, of_three, weak, weighed
+from fringescope.kernels.raw import samples_at, unpack
 from fringescope.kernels.sinusoid import follow, left_over
 
 BLOCK = 512  #: pixels of a row that are worked on together
@@ -20,6 +21,31 @@ _NAN = np.float32(np.nan)
 _P, _Q, _S = BLOCK, 2 * BLOCK, 3 * BLOCK  # where the sums of I cos, I sin and squared residuals lie in their scratch
 _CONTRACT = {"contract"}
 _FAR = np.int32(1 << 30)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def load(x, first, last, addresses, row_bytes, i, col, n, like, packed, octet, top):
+    """Samples of frames first..last-1 in row i from column `col` on, into `x` (F, BLOCK) of the type of `like`; the
+    largest of each pixel, into `top`; and the largest of all. See `fused.decode`.
+    """
+    for f in range(first, last):
+        target, row_begins = x[f], addresses[f] + i * row_bytes[f]
+        if packed:
+            unpack(samples_at(row_begins + col // 2 * 3, n // 2 * 3, octet), n, target)
+            continue
+        source = samples_at(row_begins + col * like.itemsize, n, like)
+        for j in range(n):
+            target[j] = source[j]
+    for j in range(n):
+        top[j] = x[first, j]
+    for f in range(first + 1, last):
+        target = x[f]
+        for j in range(n):
+            top[j] = max(top[j], target[j])
+    brightest = top[0]
+    for j in range(n):
+        brightest = max(brightest, top[j])
+    return brightest
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)

@@ -24,6 +24,7 @@ from fringescope.kernels.blocks import (
     four,
     judge,
     leave_dark,
+    load,
     order_margin,
     ramp,
     row_between,
@@ -34,7 +35,6 @@ from fringescope.kernels.blocks import (
 from fringescope.kernels.depths import mark_outside, points, row_cubics
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
 from fringescope.kernels.pixel import TWO_PI
-from fringescope.kernels.raw import samples_at, unpack
 from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
 
@@ -165,8 +165,12 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
     return reasons, best / turn, own / turn, a, b
 
 
-@by_rows(lambda _addresses, _bytes, _like, _packed, _sets, _limits, _bounds, _usual, _depths, phase, *_: phase.shape[0])
-def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths,
+@by_rows(
+    lambda _begin, _end, _addresses, _bytes, _like, _packed, _sets, _limits, _bounds, _usual, _depths, phase, *_: (
+        phase.shape[0]
+    )
+)
+def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths,
            phase, sigma, background, modulation, reasons, xyz, sigma_mm):  # fmt: skip
     """Raw frames to points: the rows of frame f lie `row_bytes[f]` apart in memory, from `addresses[f]` on, as samples
     of the type of the array `like`; or `packed`, two samples of 12 bits in three octets.
@@ -174,6 +178,11 @@ def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds
     Writes (H, W) absolute phase of the finest set and its sigma, radians; A and B, codes; reason bits; world points,
     mm, and their sigma along the ray. `bounds` (4, h', w') and `usual` (h'', w'') span the picture corner on corner:
     orders' bounds in turns, the usual contrast of the finest set over that of the next coarser one.
+
+    Sets `begin` .. `end` - 1 are taken: all, or as they come. Before the last of them the outputs hold what the sets so
+    far say, for the next call to go on from: absolute phase, its variance, turns; squared margin, B, misfit; and at the
+    head of each block whether all sets have to be taken at once: for orders that only they tell apart, and saturated
+    samples. Frames of sets that are yet to come are not read.
     """
     F, K = len(addresses), len(sets.frequency)
     height, W = phase.shape
@@ -209,38 +218,42 @@ def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds
         row_cubics(depths.table, i, depths.step, row)
         for col in range(0, W, BLOCK):
             n = min(BLOCK, W - col)
-            for f in range(F):
-                target, row_begins = x[f], addresses[f] + i * row_bytes[f]
-                if packed:
-                    unpack(samples_at(row_begins + col // 2 * 3, n // 2 * 3, octet), n, target)
-                    continue
-                source = samples_at(row_begins + col * like.itemsize, n, like)
-                for j in range(n):
-                    target[j] = source[j]
+            out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
+            out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
+            point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
+            a = begin if begin > 0 and out_r[0] == 0 else 0
+            if a == 0 and begin > 0 and end < K:
+                continue  # once all sets have come
+            f, g = sets.start[a], sets.start[end]
+            brightest = load(x, f, g, addresses, row_bytes, i, col, n, like, packed, octet, top)
+            if a > 0 and brightest >= sets.top and end == K:
+                brightest = load(x, 0, F, addresses, row_bytes, i, col, n, like, packed, octet, top)
+                a = 0
             for j in range(n):
-                top[j] = x[0, j]
                 rough[j] = _ZERO
-            for f in range(1, F):
-                target = x[f]
+            if a > 0:
+                before, coarse_b = own[a - 1], mod[a - 1]
                 for j in range(n):
-                    top[j] = max(top[j], target[j])
-            brightest = top[0]
-            for j in range(n):
-                brightest = max(brightest, top[j])
+                    absolute[j] = out_phase[j]
+                    before[j] = out_sigma[j]
+                    margin2[j] = out_a[j]
+                    coarse_b[j] = out_b[j]
+                    rough[j] = along[j]
+                    chi2[j] = _ZERO
             dark = False
-            for back_to_front in range(K):  # the finest set first: where it is dark all over, that is all
-                k = K - 1 - back_to_front
-                a, b = sets.start[k], sets.start[k + 1]
+            for back_to_front in range(end - a):  # the finest set first: where it is dark all over, that is all
+                k = end - 1 - back_to_front
+                f, g = sets.start[k], sets.start[k + 1]
                 pivot = sets.pivot
-                if b - a == 4 and sets.plain[k]:
-                    four(x, a, n, acc)
+                if g - f == 4 and sets.plain[k]:
+                    four(x, f, n, acc)
                     pivot = _ZERO
-                elif b - a == 8 and sets.plain[k]:
-                    eight(x, a, n, acc)
+                elif g - f == 8 and sets.plain[k]:
+                    eight(x, f, n, acc)
                     pivot = _ZERO
                 else:
-                    sums(x, a, b, sets.cos, sets.sin, pivot, n, acc)
-                fit(acc, b - a, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k],
+                    sums(x, f, g, sets.cos, sets.sin, pivot, n, acc)
+                fit(acc, g - f, limits.noise_a, limits.noise_b, limits.misfit, pivot, n, wrapped[k], own[k],
                      back if k == K - 1 else other, mod[k], rough)  # fmt: skip
                 if k == K - 1 and brightest < sets.top:
                     dark = all_dark(back, n, limits.background)
@@ -248,10 +261,7 @@ def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds
                     break
             if dark:
                 leave_dark(back, mod[K - 1], limits, n, bits)
-                point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
-                out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
-                out_a, out_b = background[i, col : col + n], modulation[i, col : col + n]
-                out_r, b, fine_2 = reasons[i, col : col + n], mod[K - 1], own[K - 1]
+                b, fine_2 = mod[K - 1], own[K - 1]
                 for j in range(n):
                     along[j] = point[j, 0] = point[j, 1] = point[j, 2] = out_phase[j] = _NAN
                 for j in range(n):
@@ -262,25 +272,43 @@ def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds
                 continue
             for m in range(2):
                 ramp(limit_row[m], limit_scale, col, n, limit[m])
+            low = high = 0
+            if a == 0:
+                low, high = candidates(wrapped[0], limit[0], limit[1], per_turn, slack, n)
+            if end < K:
+                out_r[0] = 0 if low == high and brightest < sets.top else 1
+                if out_r[0] != 0:
+                    continue
+            if low == high:  # else the loop over orders, below
+                if a == 0:
+                    coarsest(wrapped[0], _f(low), n, absolute, chi2, margin2)
+                for k in range(max(a, 1), end):
+                    step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
+            if end < K:
+                variance, b = own[end - 1], mod[end - 1]
+                for j in range(n):
+                    out_phase[j] = absolute[j]
+                    out_sigma[j] = variance[j]
+                    out_a[j] = margin2[j]
+                    out_b[j] = b[j]
+                    along[j] = rough[j]
+                continue
             ramp(usual_row, usual_scale, col, n, around)
-            low, high = candidates(wrapped[0], limit[0], limit[1], per_turn, slack, n)
             if low != high or brightest >= sets.top:
                 for m in range(2, 4):
                     ramp(limit_row[m], limit_scale, col, n, limit[m])
-            if low != high:
+            if low == high:
+                accept(absolute, limit, n, best)
+            else:
                 for j in range(n):
                     best[j] = _NAN
                     best_chi2[j] = second[j] = best_margin2[j] = _INF
-            for order in range(low, high + 1):
-                coarsest(wrapped[0], _f(order), n, absolute, chi2, margin2)
-                for k in range(1, K):
-                    step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
-                if low == high:
-                    accept(absolute, limit, n, best)
-                else:
+                for order in range(low, high + 1):
+                    coarsest(wrapped[0], _f(order), n, absolute, chi2, margin2)
+                    for k in range(1, K):
+                        step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
                     consider(absolute, chi2, margin2, limit, limits.unexpected, n, best, best_chi2, second,
-                              best_margin2)  # fmt: skip
-            if low != high:
+                             best_margin2)  # fmt: skip
                 order_margin(best_chi2, second, best_margin2, n, margin2)
             b = mod[K - 1]
             judge(own[K - 1], back, b, mod[max(K - 2, 0)], rough, around, best, margin2, limits, n, fine, bits)
@@ -292,7 +320,6 @@ def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds
             lost = ~limits.uncertain
             for j in range(n):
                 lost = lost if bits[j] & ~limits.uncertain else np.uint16(0)
-            point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
             if lost != 0:
                 for j in range(n):
                     along[j] = point[j, 0] = point[j, 1] = point[j, 2] = _NAN
@@ -303,8 +330,6 @@ def decode(first, last, addresses, row_bytes, like, packed, sets, limits, bounds
                     point[j, 0] = X[j]
                     point[j, 1] = Y[j]
                     point[j, 2] = Z[j]
-            out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
-            out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
             for j in range(n):
                 out_phase[j] = TWO_PI * best[j]
                 out_sigma[j] = TWO_PI * fine[j]

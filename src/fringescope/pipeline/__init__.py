@@ -6,7 +6,7 @@ parts it is made of. `preview` is what can be shown first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fringescope import denoise, fuse, geometry, memory, phase, response, triangulate
-from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, ResourceError, UsageError
-from fringescope.pipeline import coarse, fast
+from fringescope import denoise, fuse, geometry, phase, response, triangulate
+from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
+from fringescope.pipeline import arrival, coarse, fast
 from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
 from fringescope.threads import WORKERS
@@ -75,8 +75,14 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings, *, device: Device = "cpu")
     """
     check_device(device)
     geometry.check_baseline(rig, rig.camera(view.plan.camera))
-    view = replace(view, frames=list(view.frames))
-    fused = fast.decode(view, rig, s, device)  # the same in one pass, for the usual plans
+    return _scanned(*arrival.gathered(view, rig, s), rig, s, device)  # frames may still be arriving
+
+
+def _scanned(
+    view: ViewInput, begun: fast.Begun | None, rig: Rig, s: Settings, device: Device
+) -> tuple[Decoded, Grid]:
+    """See `scan_view`."""
+    fused = fast.decode(view, rig, s, device, begun)  # the same in one pass, for the usual plans
     if fused is not None:
         decoded, xyz, sigma, steps = fused
         tiles = denoise.Tiles(decoded, (steps,))
@@ -302,20 +308,47 @@ def preview(views: Sequence[ViewInput], rig: Rig, settings: Settings | None = No
     and as `scan_view`.
     """
     s = settings or Settings()
-    few, thin, strides = coarse.thinned(views, rig, s.mesh.preview_pixels)
+    first = _Coarse(rig, s)
+    first.add(views)
+    return first.surface()
 
-    def one(view: ViewInput, n: int) -> tuple[Grid, Photo, tuple[str, ...]]:
-        decoded, grid = scan_view(view, thin, coarse.settings_for(n, s))
-        return grid, picture(view, decoded, s), decoded.notes
 
-    with ThreadPoolExecutor(WORKERS) as pool:  # little pictures leave cores idle
-        made = sorted(pool.map(one, few, strides), key=lambda m: m[0].view)
-    grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
-    if not any(g.valid.any() for g in grids):
-        words = [w for g in grids for w in denoise.verdict(g).words[1:]]
-        words += [f"{g.camera}: {note}" for g, _, notes in made for note in notes]
-        raise EmptyResultError("no point was left; " + "; ".join(words))
-    return fuse.preview(fuse.merge(grids, [photo for _, photo, _ in made], thin, s.fuse), thin, s.mesh)
+class _Coarse:
+    """The coarse surface, of views as they come."""
+
+    def __init__(self, rig: Rig, s: Settings) -> None:
+        self._rig, self._s = rig, s
+        self._thin = rig
+        self._made: list[tuple[Grid, Photo, tuple[str, ...]]] = []
+        self.views = 0  #: that have come
+        self.seconds = 0.0  #: that it took
+
+    def add(self, views: Sequence[ViewInput]) -> None:
+        """Views have come, with all their frames. Raises as `scan_view`."""
+        start = perf_counter()
+        few, self._thin, strides = coarse.thinned(views, self._rig, self._s.mesh.preview_pixels)
+
+        def one(view: ViewInput, n: int) -> tuple[Grid, Photo, tuple[str, ...]]:
+            decoded, grid = scan_view(view, self._thin, coarse.settings_for(n, self._s))
+            return grid, picture(view, decoded, self._s), decoded.notes
+
+        with ThreadPoolExecutor(WORKERS) as pool:  # little pictures leave cores idle
+            self._made += pool.map(one, few, strides)
+        self.views += len(views)
+        self.seconds += perf_counter() - start
+
+    def surface(self) -> Surface:
+        """What the views make together. Raises EmptyResultError."""
+        start = perf_counter()
+        made, s, thin = sorted(self._made, key=lambda m: m[0].view), self._s, self._thin
+        grids = denoise.agree([grid for grid, _, _ in made], thin, s.denoise, in_place=True)
+        if not any(g.valid.any() for g in grids):
+            words = [w for g in grids for w in denoise.verdict(g).words[1:]]
+            words += [f"{g.camera}: {note}" for g, _, notes in made for note in notes]
+            raise EmptyResultError("no point was left; " + "; ".join(words))
+        out = fuse.preview(fuse.merge(grids, [photo for _, photo, _ in made], thin, s.fuse), thin, s.mesh)
+        self.seconds += perf_counter() - start
+        return out
 
 
 def scan(
@@ -333,42 +366,49 @@ def scan(
 
     `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Where the
     points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. `device`:
-    see `scan_view`. `first` is called with the coarse surface of `preview` before the fine work begins, and not called
-    where there is none; then all views' frames are held in memory. Raises EmptyResultError, with the reasons, if no
-    view keeps a point; and as `scan_view`.
+    see `scan_view`. `first` is called with the coarse surface of `preview`, and not called where there is none: as soon
+    as all frames have come, and before the fine work on them begins.
+
+    Frames of a view that are neither a list nor a tuple are taken in another thread as they come, view after view in
+    their order, while views that are there are worked on. Raises EmptyResultError, with the reasons, if no view keeps a
+    point; and as `scan_view`, and what the frames raise.
     """
     s = settings or Settings()
-    _check_memory(views, rig, at_once=first is not None)
+    check_device(device)
+    arrival.check_memory(views, rig)
     tell = progress or _silent
     times: dict[str, float] = {}
     grids: list[Grid] = []
     photos: list[Photo] = []
     notes: dict[str, tuple[str, ...]] = {}
     figures: dict[str, Any] = {"views": {}}
+    early = _Coarse(rig, s)
     if first is not None:
         tell("coarse surface", 0.0)
-        start = perf_counter()
-        views = [replace(view, frames=list(view.frames)) for view in views]
-        coarsest = _preview_if_any(views, rig, s)
-        times["preview"] = perf_counter() - start
-        if coarsest is not None:
-            first(coarsest)
+        _show_early(early, [view for view in views if arrival.is_here(view)], len(views), first)
 
     def one(view: ViewInput) -> tuple[Decoded, Grid, Photo, float]:
+        geometry.check_baseline(rig, rig.camera(view.plan.camera))
+        come, begun = arrival.gathered(view, rig, s)
+        if first is not None and not arrival.is_here(view):
+            come = arrival.held(come)
+            _show_early(early, [come], len(views), first)
         start = perf_counter()
-        decoded, grid = scan_view(view, rig, s, device=device)
-        return decoded, grid, picture(view, decoded, s), perf_counter() - start
+        decoded, grid = _scanned(come, begun, rig, s, device)
+        return decoded, grid, picture(come, decoded, s), perf_counter() - start
 
-    made = _each(one, views, rig) if device == "cpu" else map(one, views)
-    for n, view in enumerate(views):
-        tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
-        decoded, grid, photo, took = next(made)
-        grids.append(grid)
-        photos.append(photo)
-        times[f"scan_view {grid.camera}"] = took
-        figures["views"][grid.camera] = _figures(view, decoded, grid)
-        figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
-        notes[grid.camera] = tuple(f"{grid.camera}: {note}" for note in decoded.notes)
+    with arrival.each(one, views, rig, at_once=device == "cpu" and first is None) as made:
+        for n, view in enumerate(views):
+            tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
+            decoded, grid, photo, took = next(made)
+            grids.append(grid)
+            photos.append(photo)
+            times[f"scan_view {grid.camera}"] = took
+            figures["views"][grid.camera] = _figures(view, decoded, grid)
+            figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
+            notes[grid.camera] = tuple(f"{grid.camera}: {note}" for note in decoded.notes)
+    if first is not None:
+        times["preview"] = early.seconds
     order = np.argsort([g.view for g in grids])
     grids, photos = [grids[i] for i in order], [photos[i] for i in order]
     tell("comparing the views", 0.7)
@@ -400,51 +440,17 @@ def scan(
     return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, small, every)
 
 
-LITTLE = 1_000_000  #: pixels of pictures that leave cores idle
-
-
-def _each(work: Callable[[ViewInput], T], views: Sequence[ViewInput], rig: Rig) -> Iterator[T]:
-    """What `work` gives for each view, in their order; little pictures whose frames are there are worked on at once."""
-    sizes = [rig.camera(v.plan.camera).lens for v in views]
-    if all(L.width * L.height <= LITTLE for L in sizes) and all(isinstance(v.frames, Sized) for v in views):
-        with ThreadPoolExecutor(WORKERS) as pool:
-            yield from pool.map(work, views)
-    else:
-        yield from map(work, views)
-
-
-def _preview_if_any(views: Sequence[ViewInput], rig: Rig, s: Settings) -> Surface | None:
-    try:
-        return preview(views, rig, s)
-    except EmptyResultError:  # the fine scan may still keep points, or says why not
-        return None
-
-
-VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud
-
-
-def _check_memory(views: Sequence[ViewInput], rig: Rig, at_once: bool) -> None:
-    """Raise ResourceError if the machine has too little memory left for a scan of these views; `at_once`: all their
-    frames are held.
-    """
-    free = memory.available()
-    if free is None or not views:
+def _show_early(early: _Coarse, views: Sequence[ViewInput], count: int, show: Callable[[Surface], None]) -> None:
+    """Views have come; if now all of `count` have, their coarse surface is shown, if they make one."""
+    if not views:
         return
-    lenses = [rig.camera(v.plan.camera).lens for v in views]
-    pixels = [lens.width * lens.height for lens in lenses]
-    unread = [0 if isinstance(v.frames, list | tuple) else len(v.plan.keys) * v.plan.pixel_format.dtype.itemsize
-              for v in views]  # fmt: skip
-    frames = [n * u for n, u in zip(pixels, unread, strict=True)]
-    if at_once:
-        need = max(n * VIEW_BYTES for n in pixels) + sum(frames)
-    else:
-        need = max(n * VIEW_BYTES + f for n, f in zip(pixels, frames, strict=True))
-    need += sum(pixels) * (KEPT_BYTES + CLOUD_BYTES)
-    if need > free:
-        raise ResourceError(
-            f"{len(views)} views, {sum(pixels) / 1e6:.1f} megapixels in all, need about {need / 1e9:.1f} GB of memory; "
-            f"{free / 1e9:.1f} GB are free: close other programs, or scan fewer views or smaller pictures at a time"
-        )
+    early.add(views)
+    if early.views == count:
+        try:
+            surface = early.surface()
+        except EmptyResultError:  # the fine scan may still keep points, or says why not
+            return
+        show(surface)
 
 
 def _silent(_what: str, _share: float) -> None:

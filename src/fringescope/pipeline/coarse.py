@@ -18,7 +18,7 @@ from fringescope.types import AnyArray, Camera, FrameKey, Lens, PixelFormat, Rig
 
 
 def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[ViewInput, ...], Rig, tuple[int, ...]]:
-    """The views with every n-th row and column alone, the rig whose cameras have such pixels, and n of each view.
+    """The views with every n-th row and column alone, the rig whose cameras all have such pixels, n of each view.
 
     n is odd, so that every colour of a mosaic comes in, and leaves about `pixels` of each view: from a third to three
     times as many, fewer only where a view has fewer. A view of another size than the rig's stays whole, for the stages
@@ -27,7 +27,7 @@ def thinned(views: Sequence[ViewInput], rig: Rig, pixels: int) -> tuple[tuple[Vi
     """
     with ThreadPoolExecutor(WORKERS) as pool:
         made = list(pool.map(lambda view: _thinned(view, rig.camera(view.plan.camera).lens, pixels), views))
-    strides = [1] * len(rig.cameras)
+    strides = [stride_for(c.lens, pixels) for c in rig.cameras]
     for view, n in made:
         strides[rig.index(view.plan.camera)] = n
     return tuple(view for view, _ in made), thinned_rig(rig, tuple(strides)), tuple(n for _, n in made)

@@ -6,8 +6,9 @@ response corrections, RGB, very deep measuring spaces) goes the stages' way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -37,6 +38,7 @@ from fringescope.types import (
 )
 
 Device = Literal["cpu", "gpu"]  #: where the fused kernel runs
+Family = Sequence[tuple[int, tuple[float, float]]]  #: number and gradient of each parallel set, coarse to fine
 
 MOST_ERROR_MM = 1e-4  #: of the depth table against the exact solution
 TWO_PI = 2 * np.pi
@@ -59,6 +61,14 @@ class Way:
     usual: F64  #: (8, 8)
 
 
+class Begun(NamedTuple):
+    """What the coarser sets of a view say, worked out while its finer ones were still on their way."""
+
+    sets: int  #: how many, from the coarsest on
+    noise: NoiseModel  #: that it rests on
+    out: tuple[AnyArray, ...]  #: the outputs of the kernel, which hold it
+
+
 class Fused(NamedTuple):
     """A decoded view with points (H, W, 3) and their sigma, mm, (H, W) of all pixels, and the steps of its phase."""
 
@@ -68,19 +78,21 @@ class Fused(NamedTuple):
     steps: F32
 
 
-def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> Fused | None:
+def decode(
+    view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu", begun: Begun | None = None
+) -> Fused | None:
     """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
     in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
-    `view.frames` must be a sequence. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
+    `view.frames` must be a sequence, unless `takes` refuses the view. What was `begun` is gone on from, if it rests on
+    what all frames say. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
     """
     way = way_of(view, rig, s)
     if way is None:
         return None
     H, W = _size(way.frames[0])
-    absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
-    reasons, xyz = memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32)
-    out = (absolute, sigma, A, B, reasons, xyz, sigma_mm)
+    out = begun.out if begun is not None else _room(H, W)
+    absolute, sigma, A, B, reasons, xyz, sigma_mm = out
     if device == "gpu":
         from fringescope.pipeline import gpu  # only then: Numba's CUDA is slow to import
 
@@ -89,7 +101,7 @@ def decode(view: ViewInput, rig: Rig, s: Settings, device: Device = "cpu") -> Fu
         frames = [phase.unpacked(f, view.plan.pixel_format) for f in way.frames]
         gpu.by_slabs(frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
     else:
-        on_cpu(way, out)
+        on_cpu(way, out, begun.sets if begun is not None and _still_holds(begun, way, s) else 0)
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -124,12 +136,95 @@ def _points_again(
     decoded.reasons[moved] = np.where(inside, decoded.reasons[moved] & ~bit, decoded.reasons[moved] | bit)
 
 
+def takes(view: ViewInput) -> bool:
+    """Whether the plan of a view is one for the fused kernel; its frames may still turn out not to be."""
+    return view.response is None and _parallel(view.plan) is not None
+
+
+class Beginning:
+    """Frames of a view as they come, gathered; what the coarser sets say is worked out while finer ones are on their
+    way. Frames that are unlike what the plan says are gathered all the same, for `decode` or the stages to refuse.
+    """
+
+    def __init__(self, view: ViewInput, rig: Rig, s: Settings) -> None:
+        self.frames: list[tuple[FrameKey, AnyArray]] = []
+        self._view, self._rig, self._s = view, rig, s
+        self._family = _parallel(view.plan) or []
+        self._done = 0
+        self._way: Way | None = None
+        self._out: tuple[AnyArray, ...] = ()
+
+    def add(self, key: FrameKey, frame: AnyArray) -> None:
+        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it."""
+        self.frames.append((key, frame))
+        while self._done < len(self._family) - 1 and len(self.frames) < len(self._view.plan.keys):
+            got = _in_order(replace(self._view, frames=self.frames), self._family, self._done + 1)
+            if got is None:
+                return
+            if self._way is None:
+                self._way = _first_way(self._view, got, self._family, self._rig, self._s)
+                if self._way is None:
+                    self._family = []
+                    return
+                self._out = _room(*_size(got[0]))
+            self._way = replace(self._way, frames=got)
+            on_cpu(self._way, self._out, self._done, self._done + 1)
+            self._done += 1
+
+    @property
+    def begun(self) -> Begun | None:
+        """What has been worked out so far, if anything."""
+        return Begun(self._done, self._way.noise, self._out) if self._way is not None else None
+
+
+def _room(H: int, W: int) -> tuple[AnyArray, ...]:
+    """The outputs of the kernel: phase, sigma, A, B, reasons, points, their sigma."""
+    absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
+    return absolute, sigma, A, B, memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32), sigma_mm
+
+
+SAME_NOISE = 0.05  #: by which the noise of some sets may differ from that of all, relative to its variance
+
+
+def _still_holds(begun: Begun, way: Way, s: Settings) -> bool:
+    """Whether all frames say of noise and systematic errors what was taken for granted."""
+    levels = np.array([0.1, 0.5, 0.9]) * way.sets.top
+    then, now = begun.noise.variance(levels), way.noise.variance(levels)
+    return bool(
+        np.all(np.abs(then - now) <= SAME_NOISE * now) and way.limits.systematic == f4(s.phase.systematic_rad / TWO_PI)
+    )
+
+
+def _first_way(
+    view: ViewInput, frames: tuple[AnyArray, ...], family: Family, rig: Rig, s: Settings
+) -> Way | None:
+    """As `way_of`, from the frames of the coarsest set: with its noise and the usual systematic errors."""
+    plan, camera = view.plan, rig.camera(view.plan.camera)
+    H, W = _size(frames[0])
+    if (camera.lens.width, camera.lens.height) != (W, H):
+        return None
+    g = family[-1][1]
+    table = _table(rig, camera, g, s.denoise.volume_margin)
+    if table is None:
+        return None
+    every = denoise.odd_stride(H * W)
+    thin = [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
+    few = phase.measure(thin, replace(plan, sets=(plan.sets[family[0][0]],)), s.phase, view.noise)
+    steps = [_fringes(plan, n).steps for n, _ in family]
+    limits = _limits(few.noise, plan.pixel_format, steps, math.inf, 0.0, s.phase.systematic_rad, s)
+    bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
+    return Way(
+        frames, g, few.noise, (), table, _sets(family, steps, plan.pixel_format, few.background), limits,
+        _depths(table, rig, camera, s), bounds, np.ones((2, 2)),
+    )  # fmt: skip
+
+
 def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
     """What the kernel needs to know of a view; None for one that it does not take."""
     plan, camera = view.plan, rig.camera(view.plan.camera)
-    family = _parallel(plan)
+    family = _parallel(plan) if takes(view) else None
     frames = _in_order(view, family) if family else None
-    if frames is None or family is None or view.response is not None:
+    if frames is None or family is None:
         return None
     H, W = _size(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
@@ -148,11 +243,20 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
     fmt = plan.pixel_format
     dark, low = denoise.weak(few, fmt, s.denoise)
     sigma_rad, contrast, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
+    sets = _sets(family, steps, fmt, few.sets[numbers[0]].background)
+    bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
+    limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
+    depths = _depths(table, rig, camera, s)
+    return Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
+
+
+def _sets(family: Family, steps: Sequence[int], fmt: PixelFormat, background: F32) -> k.Sets:
+    """The sets as the kernel has them; `background`: some of the coarsest one's."""
+    g = family[-1][1]
     angles = np.concatenate([TWO_PI * np.arange(n) / n for n in steps])
     signs = np.repeat([1.0 if np.dot(h, g) > 0 else -1.0 for _, h in family], steps)  # of sets that point the other way
     frequency = np.array([float(np.hypot(*h)) for _, h in family])
-    pivot = float(np.median(few.background)) if fmt.bits > 10 else 0.0
-    sets = k.Sets(
+    return k.Sets(
         np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
         np.cos(angles).astype(f4),
         (signs * np.sin(angles)).astype(f4),
@@ -160,15 +264,11 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
         frequency,
         np.array([np.dot(h, g) > 0 for _, h in family]),
         fmt.max_value,
-        f4(pivot),
+        f4(np.median(background) if fmt.bits > 10 else 0.0),
     )
-    bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
-    limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
-    depths = _depths(table, rig, camera, s)
-    return Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
-def _parallel(plan: ViewPlan) -> list[tuple[int, tuple[float, float]]] | None:
+def _parallel(plan: ViewPlan) -> Family | None:
     """Number and gradient of each set, coarse to fine; None unless all are fringes of one direction, no two alike."""
     if plan.pixel_format is PixelFormat.RGB8 or not all(isinstance(one, FringeSet) for one in plan.sets):
         return None
@@ -189,19 +289,22 @@ def _fringes(plan: ViewPlan, n: int) -> FringeSet:
     return one
 
 
-def _in_order(
-    view: ViewInput, family: Sequence[tuple[int, tuple[float, float]]]
-) -> tuple[AnyArray, ...] | None:
-    """The frames of the sets, coarse to fine, step by step; None if any is missing, doubled or unlike the others."""
+def _in_order(view: ViewInput, family: Family, sets: int | None = None) -> tuple[AnyArray, ...] | None:
+    """The frames of the sets (of the `sets` coarsest ones), coarse to fine, step by step; None if any is missing,
+    doubled or unlike the others.
+    """
     there: dict[FrameKey, AnyArray] = {}
     for key, frame in view.frames:
         if key in there or (frame.ndim != 2 and not view.plan.pixel_format.packs(frame)):
             return None
         there[key] = frame
     keys = [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(view.plan, n).steps)]
-    if set(keys) != set(there):
+    if sets is None and set(keys) != set(there):
         return None
-    frames = tuple(there[key] for key in keys)
+    wanted = keys if sets is None else keys[: sum(_fringes(view.plan, n).steps for n, _ in family[:sets])]
+    if not all(key in there for key in wanted):
+        return None
+    frames = tuple(there[key] for key in wanted)
     like = frames[0]
     if any(f.shape != like.shape or f.dtype != like.dtype for f in frames) or like.dtype not in (np.uint8, np.uint16):
         return None
@@ -254,11 +357,16 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
     )
 
 
-def on_cpu(way: Way, out: tuple[AnyArray, ...]) -> None:
-    """Runs the kernel over rows on all cores; it reads the frames where they lie, packed ones too."""
+def on_cpu(way: Way, out: tuple[AnyArray, ...], begin: int = 0, end: int | None = None) -> None:
+    """Runs the kernel over rows on all cores, on sets `begin` .. `end` - 1; it reads the frames where they lie, packed
+    ones too. Frames of later sets may be missing.
+    """
     frames = [f if f[0].flags.c_contiguous else np.ascontiguousarray(f) for f in way.frames]
-    addresses = np.array([f.ctypes.data for f in frames], np.int64)
-    row_bytes = np.array([f.strides[0] for f in frames], np.int64)
+    addresses, row_bytes = np.zeros(way.sets.start[-1], np.int64), np.zeros(way.sets.start[-1], np.int64)
+    addresses[: len(frames)] = [f.ctypes.data for f in frames]
+    row_bytes[: len(frames)] = [f.strides[0] for f in frames]
     packed = frames[0].ndim == 3
     like = np.empty(0, np.uint16 if packed else frames[0].dtype)
-    k.decode(addresses, row_bytes, like, packed, way.sets, way.limits, way.bounds, way.usual, way.depths, *out)
+    last = len(way.sets.frequency) if end is None else end
+    k.decode(begin, last, addresses, row_bytes, like, packed, way.sets, way.limits, way.bounds, way.usual, way.depths,
+             *out)  # fmt: skip
