@@ -13,6 +13,7 @@ from fringescope.kernels.raw import samples_at, unpack
 from fringescope.kernels.sinusoid import follow, left_over
 
 BLOCK = 512  #: pixels of a row that are worked on together
+COUNT = np.arange(BLOCK, dtype=np.float32)  #: a counter that needs no conversion to float
 
 _f = np.float32
 _ZERO, _ONE, _TWO = (np.float32(c) for c in (0.0, 1.0, 2.0))
@@ -20,7 +21,7 @@ _INF = np.float32(np.inf)
 _NAN = np.float32(np.nan)
 _P, _Q, _S = BLOCK, 2 * BLOCK, 3 * BLOCK  # where the sums of I cos, I sin and squared residuals lie in their scratch
 _CONTRACT = {"contract"}
-_FAR = np.int32(1 << 30)
+_FAR, _NEAR = np.int32(1 << 30), np.int32(-(1 << 30))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -154,7 +155,7 @@ def ramp(nodes, scale, col, n, out):
         begin, step = _f(nodes[k] + slope * (col + j - k / scale)), _f(slope)
         target = out[j:end]
         for i in range(end - j):
-            target[i] = begin + step * _f(i)
+            target[i] = begin + step * COUNT[i]
         j = end
 
 
@@ -168,13 +169,17 @@ def coarsest(phase, order, n, absolute, chi2, margin2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def step(coarse, phase, fine, systematic2, ratio, n, absolute, chi2, margin2):
-    """One set finer; `coarse` and `fine` are the variances of both sets' phases, which share a systematic error."""
+def step(coarse, phase, fine, systematic2, ratio, n, absolute, chi2, so_far, margin2):
+    """One set finer; `coarse` and `fine` are the variances of both sets' phases, which share a systematic error.
+
+    `so_far` is the least margin up to here. It must not lie where `margin2` is written: there the compiler would keep
+    the lesser of two by a masked store, which is slow. So it is in `consider`.
+    """
     for j in range(n):
         a, rest, m = follow(absolute[j], coarse[j] + systematic2, phase[j], fine[j] + systematic2, ratio)
         absolute[j] = a
         chi2[j] += rest
-        least = margin2[j]
+        least = so_far[j]
         margin2[j] = m if m < least else least
 
 
@@ -188,24 +193,42 @@ def accept(absolute, bounds, n, best):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def consider(absolute, chi2, margin2, bounds, unexpected, n, best, best_chi2, second, best_margin2):
-    """Keep the order if it lies in the bounds and fits better; remember how well the next best fits."""
+def consider(absolute, chi2, margin2, bounds, unexpected, n, before, after):
+    """Keep the order if it lies in the bounds and fits better; remember how well the next best fits.
+
+    `before` and `after` (4, BLOCK): absolute phase, chi squared, that of the next best, squared margin.
+    """
     lo, hi, soft_lo, soft_hi = bounds[0], bounds[1], bounds[2], bounds[3]
+    best, best_chi2, second, best_margin2 = before[0], before[1], before[2], before[3]
+    new, new_chi2, new_second, new_margin2 = after[0], after[1], after[2], after[3]
     for j in range(n):
         a, cost, next_cost, margin = weighed(
             absolute[j], chi2[j], margin2[j], lo[j], hi[j], soft_lo[j], soft_hi[j], unexpected,
             best[j], best_chi2[j], second[j], best_margin2[j],
         )  # fmt: skip
-        best[j] = a
-        best_chi2[j] = cost
-        second[j] = next_cost
-        best_margin2[j] = margin
+        new[j] = a
+        new_chi2[j] = cost
+        new_second[j] = next_cost
+        new_margin2[j] = margin
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def order_margin(best_chi2, second, best_margin2, n, margin2):
-    """How much worse, squared, the next order fits: as a whole, or at the closest rounding on the way."""
+def nothing(n, found):
+    """No order yet, for `consider`."""
+    best, best_chi2, second, best_margin2 = found[0], found[1], found[2], found[3]
     for j in range(n):
+        best[j] = _NAN
+        best_chi2[j] = second[j] = best_margin2[j] = _INF
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def order_margin(found, n, absolute, margin2):
+    """What `consider` has found, and how much worse, squared, the next order fits: as a whole, or at the closest
+    rounding on the way.
+    """
+    best, best_chi2, second, best_margin2 = found[0], found[1], found[2], found[3]
+    for j in range(n):
+        absolute[j] = best[j]
         apart, m = second[j] - best_chi2[j], best_margin2[j]
         margin2[j] = apart if apart < m else m
 
@@ -213,12 +236,12 @@ def order_margin(best_chi2, second, best_margin2, n, margin2):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def candidates(phase, lo, hi, per_turn, slack, n):
     """First and last order of the coarsest set that any pixel of the block may have; none: last < first."""
-    first, last = _FAR, -_FAR
+    first, last = _FAR, _NEAR
     for j in range(n):
         some = lo[j] <= hi[j]
         a = np.int32(np.ceil(lo[j] * per_turn - phase[j] - slack))
         b = np.int32(np.floor(hi[j] * per_turn - phase[j] + slack))
-        a, b = a if some else _FAR, b if some else -_FAR
+        a, b = a if some else _FAR, b if some else _NEAR
         first = a if a < first else first
         last = b if b > last else last
     return first, last

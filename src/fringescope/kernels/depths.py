@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from fringescope.kernels.blocks import COUNT
 from fringescope.kernels.pixel import is_inside, point
+from fringescope.kernels.raw import borrowed
 
 FIELDS = 9  #: of the table: see `geometry.depth_table`
 
@@ -28,6 +30,15 @@ class Depths(NamedTuple):
     lens: np.ndarray  #: (10,) float32
     field: np.ndarray  #: (4,) float32: least u and v, greatest u and v, on the projector's plane
     box: np.ndarray  #: (15,) float32: centre, three axes, half sizes
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def borrowed_depths(d):
+    """See `raw.borrowed`."""
+    return Depths(
+        borrowed(d.table, d.table.shape), d.step, borrowed(d.camera, 3), d.depth, borrowed(d.projector, 12),
+        borrowed(d.lens, 10), borrowed(d.field, 4), borrowed(d.box, 15),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -87,7 +98,7 @@ def points(cycles, sigma, row, depths, col, n, X, Y, Z, sigma_mm):
         turns_, own = cycles[j : j + m], sigma[j : j + m]
         x, y, z, out = X[j : j + m], Y[j : j + m], Z[j : j + m], sigma_mm[j : j + m]
         for i in range(m):
-            t = begin + _f(i) * per_step
+            t = begin + COUNT[i] * per_step
             x[i], y[i], z[i], out[i] = point(turns_[i], own[i], t, cubics, centre, per_depth)
         j += m
 

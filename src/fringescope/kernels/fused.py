@@ -25,6 +25,7 @@ from fringescope.kernels.blocks import (
     judge,
     leave_dark,
     load,
+    nothing,
     order_margin,
     ramp,
     row_between,
@@ -32,9 +33,10 @@ from fringescope.kernels.blocks import (
     step,
     sums,
 )
-from fringescope.kernels.depths import mark_outside, points, row_cubics
+from fringescope.kernels.depths import borrowed_depths, mark_outside, points, row_cubics
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
 from fringescope.kernels.pixel import TWO_PI
+from fringescope.kernels.raw import borrowed, samples_at
 from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
 
@@ -79,6 +81,29 @@ class Limits(NamedTuple):
     uncertain: np.uint16
     outside: np.uint16
     inconsistent: np.uint16
+
+
+NO_OCTET = np.empty(0, np.uint8)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def borrowed_sets(s):
+    """See `raw.borrowed`."""
+    F, K = len(s.cos), len(s.ratio)
+    return Sets(
+        borrowed(s.start, K + 1), borrowed(s.cos, F), borrowed(s.sin, F), borrowed(s.ratio, K),
+        borrowed(s.frequency, K), borrowed(s.plain, K), s.top, s.pivot,
+    )  # fmt: skip
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def borrowed_limits(s):
+    """See `raw.borrowed`."""
+    return Limits(
+        s.noise_a, s.noise_b, s.systematic, s.unexpected, s.margin, s.misfit,
+        borrowed(s.max_clipped, len(s.max_clipped)), s.background, s.modulation, s.contrast, s.modulation_sigma,
+        s.sigma, s.fine_modulation, s.dark, s.saturated, s.low_modulation, s.uncertain, s.outside, s.inconsistent,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -185,27 +210,53 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
     samples. Frames of sets that are yet to come are not read.
     """
     F, K = len(addresses), len(sets.frequency)
+    samples, top, bits = np.empty((F, BLOCK), like.dtype), np.empty(BLOCK, like.dtype), np.empty(BLOCK, np.uint16)
+    floats = np.empty((SCRATCH + 3 * K) * BLOCK, np.float32)
+    out = phase, sigma, background, modulation, reasons, xyz, sigma_mm
+    _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, out,
+            samples, top, bits, floats)  # fmt: skip
+
+
+SCRATCH = 29  #: lines of BLOCK floats that `_decode` needs, and three for each set
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, out,
+            samples, top, bits, floats):  # fmt: skip
+    """See `decode`. Arrays are borrowed: the caller holds them."""
+    phase, sigma, background, modulation, reasons, xyz, sigma_mm = out
+    F, K = len(addresses), len(sets.frequency)
     height, W = phase.shape
-    x, octet = np.empty((F, BLOCK), like.dtype), np.empty(0, np.uint8)
-    top = np.empty(BLOCK, like.dtype)
-    acc = np.empty(4 * BLOCK, np.float32)
-    wrapped, own = np.empty((K, BLOCK), np.float32), np.empty((K, BLOCK), np.float32)
-    mod = np.empty((K, BLOCK), np.float32)
-    limit = np.empty((4, BLOCK), np.float32)
-    absolute, chi2, margin2, best, best_chi2, second, best_margin2, rough, back, around, fine, other = (
-        np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
-        np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
-        np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
-        np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
+    shape = height, W
+    phase, sigma, sigma_mm, xyz = (
+        borrowed(phase, shape), borrowed(sigma, shape), borrowed(sigma_mm, shape), borrowed(xyz, (height, 3 * W)),
     )  # fmt: skip
-    bits = np.empty(BLOCK, np.uint16)
+    background, modulation, reasons = borrowed(background, shape), borrowed(modulation, shape), borrowed(reasons, shape)
+    addresses, row_bytes = borrowed(addresses, F), borrowed(row_bytes, F)
+    like, octet = samples_at(0, 0, like), samples_at(0, 0, NO_OCTET)
+    sets, limits, depths = borrowed_sets(sets), borrowed_limits(limits), borrowed_depths(depths)
+    x, top, bits = borrowed(samples, (F, BLOCK)), borrowed(top, BLOCK), borrowed(bits, BLOCK)
+    line, room = BLOCK * floats.itemsize, floats.ctypes.data
+    wrapped, own, mod = (
+        samples_at(room, (K, BLOCK), floats), samples_at(room + K * line, (K, BLOCK), floats),
+        samples_at(room + 2 * K * line, (K, BLOCK), floats),
+    )  # fmt: skip
+    room += 3 * K * line
+    acc, limit = samples_at(room, 4 * BLOCK, floats), samples_at(room + 4 * line, (4, BLOCK), floats)
+    margins, found = (
+        samples_at(room + 8 * line, (2, BLOCK), floats), samples_at(room + 10 * line, (2, 4, BLOCK), floats)
+    )  # fmt: skip
+    lines = samples_at(room + 18 * line, (11, BLOCK), floats)
+    absolute, chi2, best, rough, back, around, fine, other = (
+        lines[0], lines[1], lines[2], lines[3], lines[4], lines[5], lines[6], lines[7]
+    )  # fmt: skip
+    X, Y, Z = lines[8], lines[9], lines[10]
     one = np.empty((4, K, 1, 1), np.float64)
     used = np.empty((K, 2), np.uint64)
     limit_row = np.empty((4, bounds.shape[2]), np.float64)
     usual_row = np.empty(usual.shape[1], np.float64)
     limit_scale, usual_scale = (bounds.shape[2] - 1) / max(W - 1, 1), (usual.shape[1] - 1) / max(W - 1, 1)
     row = np.empty(depths.table.shape[1], np.float32)
-    X, Y, Z = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     systematic2 = limits.systematic * limits.systematic
     per_turn = _f(sets.frequency[0] / sets.frequency[K - 1])
     slack = _ZERO
@@ -220,7 +271,7 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
             n = min(BLOCK, W - col)
             out_phase, out_sigma = phase[i, col : col + n], sigma[i, col : col + n]
             out_a, out_b, out_r = background[i, col : col + n], modulation[i, col : col + n], reasons[i, col : col + n]
-            point, along = xyz[i, col : col + n], sigma_mm[i, col : col + n]
+            point, along = xyz[i, 3 * col : 3 * (col + n)], sigma_mm[i, col : col + n]
             a = begin if begin > 0 and out_r[0] == 0 else 0
             if a == 0 and begin > 0 and end < K:
                 continue  # once all sets have come
@@ -231,8 +282,9 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
                 a = 0
             for j in range(n):
                 rough[j] = _ZERO
+            turn = 0  #: which of `margins` and `found` holds
             if a > 0:
-                before, coarse_b = own[a - 1], mod[a - 1]
+                margin2, before, coarse_b = margins[0], own[a - 1], mod[a - 1]
                 for j in range(n):
                     absolute[j] = out_phase[j]
                     before[j] = out_sigma[j]
@@ -263,7 +315,9 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
                 leave_dark(back, mod[K - 1], limits, n, bits)
                 b, fine_2 = mod[K - 1], own[K - 1]
                 for j in range(n):
-                    along[j] = point[j, 0] = point[j, 1] = point[j, 2] = out_phase[j] = _NAN
+                    along[j] = out_phase[j] = _NAN
+                for j in range(3 * n):
+                    point[j] = _NAN
                 for j in range(n):
                     out_sigma[j] = TWO_PI * math.sqrt(fine_2[j])
                     out_a[j] = back[j]
@@ -281,9 +335,12 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
                     continue
             if low == high:  # else the loop over orders, below
                 if a == 0:
-                    coarsest(wrapped[0], _f(low), n, absolute, chi2, margin2)
+                    coarsest(wrapped[0], _f(low), n, absolute, chi2, margins[0])
                 for k in range(max(a, 1), end):
-                    step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
+                    step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2,
+                         margins[turn], margins[1 - turn])  # fmt: skip
+                    turn = 1 - turn
+            margin2 = margins[turn]
             if end < K:
                 variance, b = own[end - 1], mod[end - 1]
                 for j in range(n):
@@ -300,16 +357,16 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
             if low == high:
                 accept(absolute, limit, n, best)
             else:
-                for j in range(n):
-                    best[j] = _NAN
-                    best_chi2[j] = second[j] = best_margin2[j] = _INF
+                nothing(n, found[0])
                 for order in range(low, high + 1):
-                    coarsest(wrapped[0], _f(order), n, absolute, chi2, margin2)
+                    coarsest(wrapped[0], _f(order), n, absolute, chi2, margins[0])
                     for k in range(1, K):
-                        step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2, margin2)
-                    consider(absolute, chi2, margin2, limit, limits.unexpected, n, best, best_chi2, second,
-                             best_margin2)  # fmt: skip
-                order_margin(best_chi2, second, best_margin2, n, margin2)
+                        step(own[k - 1], wrapped[k], own[k], systematic2, sets.ratio[k], n, absolute, chi2,
+                             margins[(k - 1) % 2], margins[k % 2])  # fmt: skip
+                    consider(absolute, chi2, margins[(K - 1) % 2], limit, limits.unexpected, n, found[turn],
+                             found[1 - turn])  # fmt: skip
+                    turn = 1 - turn
+                order_margin(found[turn], n, best, margin2)
             b = mod[K - 1]
             judge(own[K - 1], back, b, mod[max(K - 2, 0)], rough, around, best, margin2, limits, n, fine, bits)
             for j in range(n if brightest >= sets.top else 0):
@@ -322,14 +379,16 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
                 lost = lost if bits[j] & ~limits.uncertain else np.uint16(0)
             if lost != 0:
                 for j in range(n):
-                    along[j] = point[j, 0] = point[j, 1] = point[j, 2] = _NAN
+                    along[j] = _NAN
+                for j in range(3 * n):
+                    point[j] = _NAN
             else:
                 points(best, fine, row, depths, col, n, X, Y, Z, along)
                 mark_outside(X, Y, Z, depths, n, bits, limits.outside, limits.uncertain)
                 for j in range(n):
-                    point[j, 0] = X[j]
-                    point[j, 1] = Y[j]
-                    point[j, 2] = Z[j]
+                    point[3 * j] = X[j]
+                    point[3 * j + 1] = Y[j]
+                    point[3 * j + 2] = Z[j]
             for j in range(n):
                 out_phase[j] = TWO_PI * best[j]
                 out_sigma[j] = TWO_PI * fine[j]

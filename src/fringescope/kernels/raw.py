@@ -27,6 +27,14 @@ def samples_at(address, n, like):
     return carray(_pointer(address), n, like.dtype)
 
 
+@njit(cache=True, inline="always", error_model="numpy")
+def borrowed(a, shape):
+    """The contiguous array `a` in another shape, without a share in its ownership: counting the owners of each slice
+    would cost, and what threads count in one place costs most. The caller holds the array.
+    """
+    return carray(_pointer(a.ctypes.data), shape, a.dtype)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def unpack(octets, n, out):
     """n samples (an even number) of 12 bits from 3 n / 2 octets."""
