@@ -10,7 +10,7 @@ from numba import njit
 
 from fringescope.kernels.blocks import COUNT
 from fringescope.kernels.pixel import is_inside, point
-from fringescope.kernels.raw import borrowed
+from fringescope.kernels.raw import unowned
 
 FIELDS = 9  #: of the table: see `geometry.depth_table`
 
@@ -33,11 +33,11 @@ class Depths(NamedTuple):
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def borrowed_depths(d):
-    """See `raw.borrowed`."""
+def unowned_depths(d):
+    """See `raw.unowned`."""
     return Depths(
-        borrowed(d.table, d.table.shape), d.step, borrowed(d.camera, 3), d.depth, borrowed(d.projector, 12),
-        borrowed(d.lens, 10), borrowed(d.field, 4), borrowed(d.box, 15),
+        unowned(d.table), d.step, unowned(d.camera), d.depth, unowned(d.projector),
+        unowned(d.lens), unowned(d.field), unowned(d.box),
     )  # fmt: skip
 
 

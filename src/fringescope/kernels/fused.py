@@ -33,10 +33,10 @@ from fringescope.kernels.blocks import (
     step,
     sums,
 )
-from fringescope.kernels.depths import borrowed_depths, mark_outside, points, row_cubics
+from fringescope.kernels.depths import mark_outside, points, row_cubics, unowned_depths
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
 from fringescope.kernels.pixel import TWO_PI
-from fringescope.kernels.raw import borrowed, samples_at
+from fringescope.kernels.raw import samples_at, unowned
 from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
 
@@ -87,21 +87,20 @@ NO_OCTET = np.empty(0, np.uint8)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def borrowed_sets(s):
-    """See `raw.borrowed`."""
-    F, K = len(s.cos), len(s.ratio)
+def unowned_sets(s):
+    """See `raw.unowned`."""
     return Sets(
-        borrowed(s.start, K + 1), borrowed(s.cos, F), borrowed(s.sin, F), borrowed(s.ratio, K),
-        borrowed(s.frequency, K), borrowed(s.plain, K), s.top, s.pivot,
+        unowned(s.start), unowned(s.cos), unowned(s.sin), unowned(s.ratio), unowned(s.frequency), unowned(s.plain),
+        s.top, s.pivot,
     )  # fmt: skip
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def borrowed_limits(s):
-    """See `raw.borrowed`."""
+def unowned_limits(s):
+    """See `raw.unowned`."""
     return Limits(
         s.noise_a, s.noise_b, s.systematic, s.unexpected, s.margin, s.misfit,
-        borrowed(s.max_clipped, len(s.max_clipped)), s.background, s.modulation, s.contrast, s.modulation_sigma,
+        unowned(s.max_clipped), s.background, s.modulation, s.contrast, s.modulation_sigma,
         s.sigma, s.fine_modulation, s.dark, s.saturated, s.low_modulation, s.uncertain, s.outside, s.inconsistent,
     )  # fmt: skip
 
@@ -223,19 +222,16 @@ SCRATCH = 29  #: lines of BLOCK floats that `_decode` needs, and three for each 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, out,
             samples, top, bits, floats):  # fmt: skip
-    """See `decode`. Arrays are borrowed: the caller holds them."""
+    """See `decode`. The caller holds the arrays."""
     phase, sigma, background, modulation, reasons, xyz, sigma_mm = out
     F, K = len(addresses), len(sets.frequency)
     height, W = phase.shape
-    shape = height, W
-    phase, sigma, sigma_mm, xyz = (
-        borrowed(phase, shape), borrowed(sigma, shape), borrowed(sigma_mm, shape), borrowed(xyz, (height, 3 * W)),
-    )  # fmt: skip
-    background, modulation, reasons = borrowed(background, shape), borrowed(modulation, shape), borrowed(reasons, shape)
-    addresses, row_bytes = borrowed(addresses, F), borrowed(row_bytes, F)
-    like, octet = samples_at(0, 0, like), samples_at(0, 0, NO_OCTET)
-    sets, limits, depths = borrowed_sets(sets), borrowed_limits(limits), borrowed_depths(depths)
-    x, top, bits = borrowed(samples, (F, BLOCK)), borrowed(top, BLOCK), borrowed(bits, BLOCK)
+    phase, sigma, background, modulation = unowned(phase), unowned(sigma), unowned(background), unowned(modulation)
+    reasons, sigma_mm = unowned(reasons), unowned(sigma_mm)
+    xyz = samples_at(xyz.ctypes.data, (height, 3 * W), xyz)
+    addresses, row_bytes, like, octet = unowned(addresses), unowned(row_bytes), unowned(like), unowned(NO_OCTET)
+    sets, limits, depths = unowned_sets(sets), unowned_limits(limits), unowned_depths(depths)
+    x, top, bits = unowned(samples), unowned(top), unowned(bits)
     line, room = BLOCK * floats.itemsize, floats.ctypes.data
     wrapped, own, mod = (
         samples_at(room, (K, BLOCK), floats), samples_at(room + K * line, (K, BLOCK), floats),

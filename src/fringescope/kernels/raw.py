@@ -27,12 +27,17 @@ def samples_at(address, n, like):
     return carray(_pointer(address), n, like.dtype)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def borrowed(a, shape):
-    """The contiguous array `a` in another shape, without a share in its ownership: counting the owners of each slice
-    would cost, and what threads count in one place costs most. The caller holds the array.
+@intrinsic
+def unowned(_typing: Any, array: Any) -> Any:
+    """The same array without a share in its ownership, and so all slices of it: counting the owners of each slice
+    costs, most where threads count in one place. The caller holds the array.
     """
-    return carray(_pointer(a.ctypes.data), shape, a.dtype)
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        nobody = context.get_constant_null(types.MemInfoPointer(signature.return_type.dtype))
+        return builder.insert_value(args[0], nobody, 0)  # the first field of an array tells of its memory
+
+    return array(array), build
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
