@@ -468,3 +468,19 @@ def test_truncated_chi_squared_as_scipy_has_it(dof):
     few, most = (float(chi2.ppf(q, dof)) for q in (0.8, 0.998))
     want = chi2.cdf(few, dof + 2) / 0.8, most / dof, chi2.cdf(most, dof + 2) / 0.998
     np.testing.assert_allclose(noise._truncation(dof), want, rtol=1e-10)
+
+
+@pytest.mark.parametrize(("least", "most"), [(89.0, 91.0), (40.0, 200.0)])
+def test_few_pixels_tell_the_noise(least, most):
+    """10,000 pixels suffice, from dark to bright; where all are alike, no slope is made up that leads astray."""
+    sets = [core.fringes(p, 0.0, n) for p, n in ((270.0, 4), (60.0, 4), (16.0, 8))]
+    plan = core.plan(*sets, pixel_format=PixelFormat.MONO8, plane=(400, 300))
+    a, b = 0.5, 0.02
+    v, u = np.mgrid[:96, :104] * 3.0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        A = rng.uniform(least, most, u.shape)
+        found = phase.measure(core.draw(plan, u, v, A, 0.25 * A, (a, b), rng), plan, S).noise
+        for level in (least, most):
+            assert found.variance(level) == pytest.approx(a + 1 / 12 + b * level, rel=0.07)
+        assert 0.3 < found.variance(1.0) < a + 1 / 12 + 1.1 * b * most

@@ -16,7 +16,7 @@ import numpy as np
 
 from fringescope import calm, geometry, memory
 from fringescope.kernels import regions as k
-from fringescope.kernels import screens, views
+from fringescope.kernels import screens, statistics, views
 from fringescope.settings import DenoiseSettings
 from fringescope.types import (
     F32,
@@ -109,9 +109,9 @@ def weak(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> tup
     return np.asarray(s.min_background * scale > A), np.asarray(low)
 
 
-def odd_stride(pixels: int, enough: int = 50_000) -> int:
+def odd_stride(pixels: int, enough: int = 10_000) -> int:
     """Every how many-th row and column is enough for a median: odd, so that every colour of a mosaic comes in."""
-    return round(math.sqrt(pixels / enough)) | 1
+    return 2 * round((math.sqrt(pixels / enough) - 1) / 2) + 1
 
 
 def usual_exposure(
@@ -127,26 +127,24 @@ def usual_exposure(
     fine = family[-1]
     ok = ok[cut] & (fine.saturated[cut] == 0)
     sigma = fine.sigma[cut][ok]
-    limit = max(s.max_sigma_rad, s.max_sigma_factor * float(np.median(sigma))) if sigma.size else np.inf
+    limit = max(s.max_sigma_rad, s.max_sigma_factor * float(statistics.median(sigma))) if sigma.size else np.inf
     usual = np.ones((8, 8), np.float32)
     if len(family) == 1:
         return limit, 0.0, usual.astype(np.float64)
     coarse = family[-2]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(ok & (coarse.saturated[cut] == 0), fine.modulation[cut] / coarse.modulation[cut], np.nan)
-    if not np.isfinite(ratio).any():
+    there = ratio[np.isfinite(ratio)]
+    if not there.size:
         return limit, 0.0, usual.astype(np.float64)
     H, W = ratio.shape
-    usual[:] = np.nanmedian(ratio)
-    for a in range(8):
-        for b in range(8):
-            tile = ratio[a * H // 8 : (a + 1) * H // 8, b * W // 8 : (b + 1) * W // 8]
-            tile = tile[np.isfinite(tile)]
-            if tile.size > max(16, H * W // 640):
-                usual[a, b] = np.median(tile)
+    usual[:] = statistics.median(there)
+    statistics.tile_medians(ratio, max(16, H * W // 640), usual)
     contrast = np.asarray(cv2.blur(usual, (3, 3)), np.float64)
-    off = np.abs(ratio / (_between(H, 8) @ contrast @ _between(W, 8).T) - 1)
-    ripple = 1.4826 * float(np.nanmedian(off)) if min(fine.steps, coarse.steps) == 3 else 0.0
+    ripple = 0.0
+    if min(fine.steps, coarse.steps) == 3:
+        off = np.abs(ratio / (_between(H, 8) @ contrast @ _between(W, 8).T) - 1)
+        ripple = 1.4826 * float(np.nanmedian(off))
     return limit, min(s.min_fine_modulation, 1 - 3 * ripple), contrast
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import os
+import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 from numba import njit
@@ -15,6 +15,7 @@ WORKERS = max(1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffin
 BLOCKS = 8 * WORKERS  #: more blocks than workers, so that none waits long for another
 SMALL = 8  #: fewer rows than this run in one piece,
 LITTLE = 1 << 16  #: and arrays of fewer elements: other threads would only be waited for
+BLOCK = 1 << 15  #: elements that are worth a block of their own
 
 
 @functools.cache
@@ -22,11 +23,37 @@ def _pool(_process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(WORKERS, thread_name_prefix="rows")
 
 
-def by_rows(count: Callable[..., int]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def _share(work: Callable[..., None], bands: list[tuple[int, int]], args: tuple[Any, ...] = ()) -> None:
+    """Call `work(first, last, *args)` for all bands; this thread takes the next one, and so does each worker that is
+    free. The first error is raised when nobody works any longer.
+    """
+    left = iter(bands)
+    taken = threading.Lock()
+
+    def some() -> None:
+        while True:
+            with taken:
+                band = next(left, None)
+            if band is None:
+                return
+            work(*band, *args)
+
+    helpers = [_pool(os.getpid()).submit(some) for _ in range(min(WORKERS, len(bands)) - 1)]
+    try:
+        some()
+    finally:
+        busy = [h for h in helpers if not h.cancel()]  # who has not begun by now finds nothing to do
+        wait(busy)
+    for h in busy:
+        h.result()
+
+
+def by_rows(count: Callable[..., int | tuple[int, int]]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorate a kernel `f(first, last, *args)` that works on rows first..last-1 and writes nothing outside them.
 
-    The decorated kernel is called as `f(*args)`; `count(*args)` tells the number of rows. It is compiled by Numba
-    without the interpreter's lock. `f.rows` is the compiled kernel itself.
+    The decorated kernel is called as `f(*args)`; `count(*args)` tells the number of rows, and how many elements it
+    works on where those are not all of its largest array. It is compiled by Numba without the interpreter's lock.
+    `f.rows` is the compiled kernel itself.
     """
 
     def decorate(f: Callable[..., None]) -> Callable[..., None]:
@@ -34,18 +61,13 @@ def by_rows(count: Callable[..., int]) -> Callable[[Callable[..., None]], Callab
 
         @functools.wraps(f)
         def call(*args: Any) -> None:
-            n = count(*args)
-            if n < SMALL or WORKERS == 1 or max(getattr(a, "size", 0) for a in args) < LITTLE:
+            told = count(*args)
+            n, size = told if isinstance(told, tuple) else (told, max(getattr(a, "size", 0) for a in args))
+            if n < SMALL or WORKERS == 1 or size < LITTLE:
                 compiled(0, n, *args)
                 return
-            edges = [n * b // BLOCKS for b in range(BLOCKS + 1)]
-            tasks = [
-                _pool(os.getpid()).submit(compiled, a, b, *args)
-                for a, b in itertools.pairwise(edges)
-                if b > a
-            ]
-            for task in tasks:
-                task.result()
+            blocks = max(min(BLOCKS, n, size // BLOCK), WORKERS)
+            _share(compiled, [(n * b // blocks, n * (b + 1) // blocks) for b in range(blocks)], args)
 
         call.rows = compiled  # type: ignore[attr-defined]
         return call
@@ -60,10 +82,4 @@ def later(work: Callable[..., None], *args: Any) -> Future[None]:
 
 def in_bands(height: int, rows: int, work: Callable[[int, int], None]) -> None:
     """Call `work(first, last)` for bands of `rows` rows of `height`, on all cores; the first error is raised."""
-    bands = [(row, min(row + rows, height)) for row in range(0, height, rows)]
-    if len(bands) == 1 or WORKERS == 1:
-        for first, last in bands:
-            work(first, last)
-        return
-    for task in [_pool(os.getpid()).submit(work, first, last) for first, last in bands]:
-        task.result()
+    _share(work, [(row, min(row + rows, height)) for row in range(0, height, rows)])

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fringescope.kernels.tiles import TILE
+from fringescope.kernels.tiles import TILE, among
 from fringescope.threads import by_rows
 
 MOST = 8  #: turns by which a vote may change an order
@@ -17,7 +17,7 @@ CONFIRMED, SPLIT = 127, -128  #: in `changed`: the majority is for the own order
 
 _BLOCK = 512
 _TWO_PI = 2.0 * math.pi
-_INF = np.float32(np.inf)
+_ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 _CONTRACT = {"contract"}
 
 
@@ -34,7 +34,7 @@ def _run_end(looked, t, u, most):
 def _widen(phase, sigma, most, m, low, high):
     """Take a row's voters into the least and greatest phase per column."""
     for j in range(m):
-        p, a, b = phase[j], low[j], high[j]
+        p, a, b = phase[j], low[j] + _ZERO, high[j] + _ZERO  # zero: see tiles.py
         votes = sigma[j] < most
         low[j] = p if votes & (p < a) else a
         high[j] = p if votes & (p > b) else b
@@ -43,7 +43,7 @@ def _widen(phase, sigma, most, m, low, high):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def _shifted(low, high, other_low, other_high, n):
     for j in range(n):
-        a, b, p, q = low[j], high[j], other_low[j], other_high[j]
+        a, b, p, q = low[j] + _ZERO, high[j] + _ZERO, other_low[j], other_high[j]
         low[j] = p if p < a else a
         high[j] = q if q > b else b
 
@@ -72,7 +72,7 @@ def _torn_row(phase, sigma, most, reasons, weak, radius, range_, i, begin, end, 
     return some != 0
 
 
-@by_rows(lambda _phase, _sigma, _most, _reasons, _weak, _radius, _range, looked, *_: looked.shape[0])
+@by_rows(lambda _phase, _sigma, _most, _reasons, _weak, _radius, _range, looked, *_: among(looked))
 def torn(first, last, phase, sigma, most, reasons, weak, radius, range_, looked, asked, changed, some):
     """Pixels whose order the neighbours' vote may change: 1 in `asked` (H, W); `some` (h, w) are their tiles.
 
@@ -102,21 +102,29 @@ def torn(first, last, phase, sigma, most, reasons, weak, radius, range_, looked,
             u = max(end, u + 1)
 
 
-@by_rows(lambda _moved, _mark, _radius, looked, _asked: looked.shape[0])
+@by_rows(lambda _moved, _mark, _radius, looked, _asked: among(looked))
 def near(first, last, moved, mark, radius, looked, asked):
-    """Pixels within `radius` of one whose `moved` has `mark`: 1 in `asked` (H, W); others' votes stay as they were."""
+    """Pixels within `radius` of one whose `moved` has `mark`: 1 in `asked` (H, W); others' votes stay as they were.
+
+    Such a pixel is `looked` at itself, and so are all near it.
+    """
     H, W = moved.shape
     for t in range(first, last):
+        top, end = t * TILE, min(t * TILE + TILE, H)
         for u in range(looked.shape[1]):
-            if not looked[t, u]:
-                continue
-            for i in range(t * TILE, min(t * TILE + TILE, H)):
-                for j in range(u * TILE, min(u * TILE + TILE, W)):
-                    found = np.uint8(0)
-                    for y in range(max(i - radius, 0), min(i + radius + 1, H)):
-                        for x in range(max(j - radius, 0), min(j + radius + 1, W)):
-                            found |= moved[y, x] & mark
-                    asked[i, j] = np.uint8(1) if found != 0 else np.uint8(0)
+            if looked[t, u]:
+                for i in range(top, end):
+                    asked[i, u * TILE : min(u * TILE + TILE, W)] = 0
+        for s in range(max(top - radius, 0) // TILE, min((end + radius - 1) // TILE + 1, looked.shape[0])):
+            for u in range(looked.shape[1]):
+                if not looked[s, u]:
+                    continue
+                for y in range(max(s * TILE, top - radius), min(s * TILE + TILE, end + radius, H)):
+                    for x in range(u * TILE, min(u * TILE + TILE, W)):
+                        if moved[y, x] & mark:
+                            left, right = max(x - radius, 0), min(x + radius + 1, W)
+                            for i in range(max(y - radius, top), min(y + radius + 1, end)):
+                                asked[i, left:right] = 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -158,7 +166,7 @@ def _poll(phase, sigma, most, doubt, i, j, radius, least, majority, max_slope, c
     return result
 
 
-@by_rows(lambda _phase, _sigma, _most, _doubt, _asked, looked, *_: looked.shape[0])
+@by_rows(lambda _phase, _sigma, _most, _doubt, _asked, looked, *_: among(looked))
 def poll(first, last, phase, sigma, most, doubt, asked, looked, radius, least, majority, max_slope, changed):
     """Let the neighbours vote on the order of each pixel whose lowest bit is set in `asked` (H, W).
 
@@ -185,7 +193,7 @@ def poll(first, last, phase, sigma, most, doubt, asked, looked, radius, least, m
                         )
 
 
-@by_rows(lambda _changed, _asked, looked, *_: looked.shape[0])
+@by_rows(lambda _changed, _asked, looked, *_: among(looked))
 def move(first, last, changed, asked, looked, bit, mark, phase, reasons, moved, some):
     """Change orders as elected: `phase` by turns; `moved` (H, W) gets `mark`, `bit` is taken from `reasons`.
 
@@ -205,6 +213,23 @@ def move(first, last, changed, asked, looked, bit, mark, phase, reasons, moved, 
                         reasons[i, j] &= ~bit
                         moved[i, j] |= mark
                         some[t, u] = True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def usual_step(phase, sigma, most, stride, down, across):
+    """The median step, without its sign, from every `stride`-th pixel in row and column to the one `down` and `across`
+    from it, where both have a `sigma` below `most`; 0 where there is none.
+    """
+    H, W = phase.shape
+    found = np.empty((H // stride + 1) * (W // stride + 1), np.float32)
+    n = 0
+    for i in range(0, H - down, stride):
+        for j in range(0, W - across, stride):
+            d = abs(phase[i + down, j + across] - phase[i, j])
+            if sigma[i, j] < most and sigma[i + down, j + across] < most and d < _INF:
+                found[n] = d
+                n += 1
+    return np.median(found[:n]) if n > 0 else _ZERO
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -229,7 +254,7 @@ def collect(moved, looked):
     return rows, columns
 
 
-@by_rows(lambda _sigma, _most, _reasons, _bit, _weak, _changed, looked, *_: looked.shape[0])
+@by_rows(lambda _sigma, _most, _reasons, _bit, _weak, _changed, looked, *_: among(looked))
 def doubts(first, last, sigma, most, reasons, bit, weak, changed, looked, doubt, some):
     """1 in `doubt` (H, W) where `reasons` have `bit`, 4 where that does not matter (see `torn`); 2 more where the vote
     was SPLIT; `some` (h, w): tiles with a 1.
@@ -256,7 +281,7 @@ def doubts(first, last, sigma, most, reasons, bit, weak, changed, looked, doubt,
             u = max(end, u + 1)
 
 
-@by_rows(lambda _changed, _doubt, looked, *_: looked.shape[0])
+@by_rows(lambda _changed, _doubt, looked, *_: among(looked))
 def confirm(first, last, changed, doubt, looked, some):
     """Take the 1 from `doubt` where the vote has CONFIRMED the order; `some` (h, w): tiles in which it has."""
     H, W = changed.shape
@@ -272,7 +297,7 @@ def confirm(first, last, changed, doubt, looked, some):
                         some[t, u] = True
 
 
-@by_rows(lambda _doubt, looked, *_: looked.shape[0])
+@by_rows(lambda _doubt, looked, *_: among(looked))
 def note_doubts(first, last, doubt, looked, bit, reasons):
     """`bit` in `reasons` (H, W) where there is `doubt`, and nowhere else in the tiles that are looked at."""
     H, W = reasons.shape

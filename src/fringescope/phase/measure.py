@@ -10,6 +10,7 @@ import numpy as np
 
 from fringescope.errors import CaptureError
 from fringescope.kernels import fringes as k
+from fringescope.kernels import statistics
 from fringescope.phase.noise import estimate_noise
 from fringescope.phase.sums import FringeSums, GrayBits, Measured, intensity, rescue
 from fringescope.settings import PhaseSettings
@@ -62,7 +63,7 @@ def measure(
     gray = tuple(bits[i].finish(noise) for i in sorted(bits))
     sets = _merge([(m, _with_sigma(m, noise, s)) for m in measured])
     if sets:
-        finest = min(sets, key=lambda w: float(np.median(w.sigma)) / math.hypot(*w.g))
+        finest = min(sets, key=lambda w: statistics.median(w.sigma.ravel()) / math.hypot(*w.g))
         background, modulation = finest.background, finest.modulation
         reasons = np.zeros(background.shape, np.uint16)
         for w in sets:

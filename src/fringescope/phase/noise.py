@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fringescope.kernels import statistics as k
 from fringescope.phase.sums import Measured
 from fringescope.types import F64, AnyArray, NoiseModel
 from fringescope.types.capture import ROUNDING
 
-SAMPLES = 50_000  #: pixels that are enough to tell the noise
+SAMPLES = 10_000  #: pixels that are enough to tell the noise
 SPOILT = 3.0  #: a set whose residuals are this many times those of the quietest set is no measure of noise
 
 
@@ -34,7 +35,8 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
     frame, motion) and do not count. With three steps only, the backgrounds of two sets of one exposure differ by noise
     and serve instead. Falls back to 0.6 codes of read noise and b = 0.03 of the 8-bit scale.
     """
-    thin = round(math.sqrt(measured[0].phase.size / SAMPLES)) | 1 if measured else 1  # odd: every colour of a mosaic
+    pixels = measured[0].phase.size if measured else SAMPLES
+    thin = 2 * round((math.sqrt(pixels / SAMPLES) - 1) / 2) + 1  # odd: every colour of a mosaic
     cut = (slice(None, None, thin), slice(None, None, thin))
     sets: list[_Bins] = []
     for m in measured:
@@ -71,35 +73,23 @@ def _between(one: Measured, two: Measured, thin: int, max_value: int) -> _Bins:
 
 
 def _binned(background: AnyArray, variance: AnyArray, dof: int, max_value: int) -> _Bins:
-    """Variance in up to 24 bins of the background, each with the mean level of its pixels."""
-    out: list[tuple[float, float, float]] = []
-    ok = (0.01 * max_value < background) & (0.9 * max_value > background)
-    if np.count_nonzero(ok) >= 400:
-        order = np.argsort(background[ok])
-        level, rest = background[ok][order].astype(np.float64), variance[ok][order].astype(np.float64)
-        edges = np.unique(np.quantile(level, np.linspace(0, 1, 25)))
-        begin = np.searchsorted(level, edges[:-1], side="left")
-        for first, last in pairwise([*begin.tolist(), len(level)]):
-            if last - first >= 50:
-                typical = _typical(rest[first:last], dof)
-                out.append((float(level[first:last].mean()), typical, float(last - first) * dof))
-    return _Bins(*np.array(out, np.float64).reshape(-1, 3).T)
+    """Variance in up to 24 bins of the background, each with the mean level of its pixels.
 
-
-def _typical(residual: F64, dof: int) -> float:
-    """Variance behind residuals that are chi-squared but for outliers: a truncated mean, made consistent.
-
-    No median: with four steps the residuals of integer codes take few values, and a median jumps between them.
+    The residuals are chi-squared but for outliers: a truncated mean, made consistent, tells the variance. No median:
+    with four steps the residuals of integer codes take few values, and a median jumps between them.
     """
-    v = np.sort(residual)
-    start, limit, kept = _truncation(dof)
-    estimate = float(v[: max(int(0.8 * len(v)), 1)].mean()) / start
-    for _ in range(6):
-        inside = v[: int(np.searchsorted(v, limit * estimate, side="right"))]
-        if not len(inside) or len(inside) == len(v):
-            return float(v.mean()) if len(inside) else estimate
-        estimate = float(inside.mean()) / kept
-    return estimate
+    ok = (0.01 * max_value < background) & (0.9 * max_value > background)
+    background, variance = background[ok], variance[ok]
+    if len(background) < 400:
+        return _Bins(*np.zeros((3, 0)))
+    order = np.argsort(background)
+    level, rest = background[order].astype(np.float64), variance[order].astype(np.float64)
+    edges = np.unique(np.interp(np.linspace(0, len(level) - 1, 25), np.arange(len(level)), level))
+    begin = np.append(np.searchsorted(level, edges[:-1], side="left"), len(level))
+    out = np.empty((24, 3))
+    n = k.bins(level, rest, begin, 50, *_truncation(dof), out)
+    mean, typical, count = np.ascontiguousarray(out[:n].T)
+    return _Bins(mean, typical, count * dof)
 
 
 @lru_cache(maxsize=64)
@@ -148,16 +138,5 @@ def _unspoilt(sets: Sequence[_Bins]) -> list[_Bins]:
 
 def _line(x: F64, y: F64, weight: F64) -> tuple[float, float]:
     """Intercept and slope (at least 0) through variances y at levels x; bins spoilt by motion or gamma lie above it."""
-    w = weight / y**2
-    intercept, slope = 0.0, 0.0
-    for _ in range(8):
-        mean = float(np.average(x, weights=w))
-        middle = float(np.average(y, weights=w))
-        spread = max(float(np.sum(w * (x - mean) ** 2)), 1e-12)
-        slope = max(float(np.sum(w * (x - mean) * (y - middle))) / spread, 0.0)
-        intercept = middle - slope * mean
-        line = np.maximum(intercept + slope * x, ROUNDING)
-        off = (y - line) / line
-        scatter = 1.4826 * float(np.median(np.abs(off))) + 1e-3
-        w = weight / line**2 / (1 + (off / (3 * scatter)) ** 2)
-    return intercept, slope
+    intercept, slope = k.line(x, y, weight, ROUNDING)
+    return float(intercept), float(slope)

@@ -12,6 +12,7 @@ import numpy as np
 from fringescope import geometry
 from fringescope.errors import DecodeError
 from fringescope.kernels import fringes as k
+from fringescope.kernels import statistics
 from fringescope.phase.vote import elect
 from fringescope.settings import PhaseSettings
 from fringescope.types import (
@@ -69,11 +70,11 @@ def unambiguous_span(group: Sequence[WrappedSet] | Sequence[FringeSet], toleranc
     infinity where there is none within 1000 periods.
     """
     f = [math.hypot(*(w.g if isinstance(w, WrappedSet) else w.cycles_per_pixel)) for w in group]
-    for turns in range(1, 1001):
-        x = turns / f[0]
-        if all(abs(x * fi - round(x * fi)) * 2 * math.pi < tolerance_rad for fi in f[1:]):
-            return x
-    return math.inf
+    x = np.arange(1, 1001) / f[0]
+    alike = np.ones(len(x), np.bool_)
+    for fi in f[1:]:
+        alike &= np.abs(x * fi - np.round(x * fi)) * 2 * math.pi < tolerance_rad
+    return float(x[np.argmax(alike)]) if alike.any() else math.inf
 
 
 def settle_order(
@@ -151,7 +152,7 @@ def _trial(
     usual = Trial(s.systematic_rad, ())
     if len(group) < 2:
         return usual
-    cut = (slice(None, None, max(1, math.isqrt(group[0].phase.size // 40_000)) | 1),) * 2
+    cut = (slice(None, None, max(1, math.isqrt(group[0].phase.size // 10_000)) | 1),) * 2
     thin = [replace(w, phase=w.phase[cut].copy(), sigma=w.sigma[cut].copy()) for w in group]
     code = None if gray is None else np.ascontiguousarray(gray[cut])
     absolute, margin = _search(thin, bounds, code, half, soft, s)
@@ -168,9 +169,9 @@ def _trial(
     for n in range(1, len(thin)):
         ratio = f[n] / f[n - 1]
         rest = _wrapped(off[n] - off[n - 1] * ratio)
-        middle = float(np.median(rest))
-        spread = float(np.quantile(np.abs(rest - middle), 0.9)) / 1.645
-        noise = float(np.median(np.hypot(thin[n - 1].sigma[ok] * ratio, thin[n].sigma[ok])))
+        middle, reach = statistics.middle_and_reach(rest, 0.9)
+        spread = reach / 1.645
+        noise = float(statistics.median(np.hypot(thin[n - 1].sigma[ok] * ratio, thin[n].sigma[ok])))
         systematic = max(systematic, math.sqrt(max(spread**2 - noise**2, 0.0) + middle**2) / math.hypot(ratio, 1.0))
         period, other = 1 / f[n], 1 / f[n - 1]
         if noise < 0.5 and spread > 1.5:
@@ -196,7 +197,7 @@ def _wrapped(a: F64) -> F64:
 def _check_repeats(group: Sequence[WrappedSet], bounds: F64, camera: str, s: PhaseSettings) -> None:
     g = group[-1].g
     span = unambiguous_span(group, 4 * s.systematic_rad)
-    room = float(np.median(bounds[3] - bounds[2])) / (2 * math.pi * math.hypot(*g))
+    room = float(statistics.median((bounds[3] - bounds[2]).ravel())) / (2 * math.pi * math.hypot(*g))
     if room > MOST_REPEATS * span:
         raise DecodeError(
             f"view '{camera}': the sets along ({g[0]:.4g}, {g[1]:.4g}) repeat after {span:.0f} projector "

@@ -85,7 +85,7 @@ def elect(phase: F32, sigma: F32, reasons: U16, s: PhaseSettings) -> Vote:
         looked = some.copy()
         k.poll(*trusted, doubt, doubt, looked, *rules, changed)
         k.confirm(changed, doubt, looked, some)
-        some = looked if some.any() else some
+        some = looked & calm.widened(some, radius)  # elsewhere the vote would be the same again
     k.note_doubts(doubt, watched, _UNCERTAIN, reasons)
     if ever.any():
         calm.update_steps(phase, calm.widened(ever, 1), steps)
@@ -95,15 +95,6 @@ def elect(phase: F32, sigma: F32, reasons: U16, s: PhaseSettings) -> Vote:
 
 def _usual_slope(phase: F32, sigma: F32, most: np.float32) -> float:
     """Largest believable phase slope, radians per pixel: four times the usual one of trusted pixels, at most 1.2."""
-    usual = 0.0
-    stride = max(1, math.isqrt(phase.size // 60_000))  # enough for a median
-    for axis in (0, 1):
-        if phase.shape[axis] < 2:
-            continue
-        here = (slice(None, -1, stride), slice(None, None, stride))[:: 1 - 2 * axis]
-        there = (slice(1, None, stride), slice(None, None, stride))[:: 1 - 2 * axis]
-        d = phase[there] - phase[here]
-        d = d[(sigma[here] < most) & (sigma[there] < most) & np.isfinite(d)]
-        if d.size:
-            usual = max(usual, float(np.median(np.abs(d))))
+    stride = max(1, math.isqrt(phase.size // 10_000))  # enough for a median
+    usual = max(float(k.usual_step(phase, sigma, most, stride, down, 1 - down)) for down in (0, 1))
     return min(max(4 * usual, 0.2), 1.2)

@@ -66,6 +66,7 @@ class Begun(NamedTuple):
 
     sets: int  #: how many, from the coarsest on
     noise: NoiseModel  #: that it rests on
+    levels: F32  #: backgrounds, codes, at which that counts
     out: tuple[AnyArray, ...]  #: the outputs of the kernel, which hold it
 
 
@@ -152,6 +153,7 @@ class Beginning:
         self._family = _parallel(view.plan) or []
         self._done = 0
         self._way: Way | None = None
+        self._levels = np.zeros(0, np.float32)
         self._out: tuple[AnyArray, ...] = ()
 
     def add(self, key: FrameKey, frame: AnyArray) -> None:
@@ -162,10 +164,11 @@ class Beginning:
             if got is None:
                 return
             if self._way is None:
-                self._way = _first_way(self._view, got, self._family, self._rig, self._s)
-                if self._way is None:
+                first = _first_way(self._view, got, self._family, self._rig, self._s)
+                if first is None:
                     self._family = []
                     return
+                self._way, self._levels = first
                 self._out = _room(*_size(got[0]))
             self._way = replace(self._way, frames=got)
             on_cpu(self._way, self._out, self._done, self._done + 1)
@@ -174,7 +177,10 @@ class Beginning:
     @property
     def begun(self) -> Begun | None:
         """What has been worked out so far, if anything."""
-        return Begun(self._done, self._way.noise, self._out) if self._way is not None else None
+        way = self._way
+        if way is None:
+            return None
+        return Begun(self._done, way.noise, self._levels, self._out)
 
 
 def _room(H: int, W: int) -> tuple[AnyArray, ...]:
@@ -183,13 +189,13 @@ def _room(H: int, W: int) -> tuple[AnyArray, ...]:
     return absolute, sigma, A, B, memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32), sigma_mm
 
 
-SAME_NOISE = 0.05  #: by which the noise of some sets may differ from that of all, relative to its variance
+FIRST_SAMPLES = 50_000  #: pixels that tell the noise of the coarsest set alone
+SAME_NOISE = 0.1  #: by which the noise of some sets may differ from that of all, relative to its variance
 
 
 def _still_holds(begun: Begun, way: Way, s: Settings) -> bool:
     """Whether all frames say of noise and systematic errors what was taken for granted."""
-    levels = np.array([0.1, 0.5, 0.9]) * way.sets.top
-    then, now = begun.noise.variance(levels), way.noise.variance(levels)
+    then, now = begun.noise.variance(begun.levels), way.noise.variance(begun.levels)
     return bool(
         np.all(np.abs(then - now) <= SAME_NOISE * now) and way.limits.systematic == f4(s.phase.systematic_rad / TWO_PI)
     )
@@ -197,8 +203,10 @@ def _still_holds(begun: Begun, way: Way, s: Settings) -> bool:
 
 def _first_way(
     view: ViewInput, frames: tuple[AnyArray, ...], family: Family, rig: Rig, s: Settings
-) -> Way | None:
-    """As `way_of`, from the frames of the coarsest set: with its noise and the usual systematic errors."""
+) -> tuple[Way, F32] | None:
+    """As `way_of`, from the frames of the coarsest set: with its noise and the usual systematic errors; and low, usual
+    and high backgrounds.
+    """
     plan, camera = view.plan, rig.camera(view.plan.camera)
     H, W = _size(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
@@ -207,16 +215,18 @@ def _first_way(
     table = _table(rig, camera, g, s.denoise.volume_margin)
     if table is None:
         return None
-    every = denoise.odd_stride(H * W)
+    every = denoise.odd_stride(H * W, FIRST_SAMPLES)
     thin = [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
     few = phase.measure(thin, replace(plan, sets=(plan.sets[family[0][0]],)), s.phase, view.noise)
     steps = [_fringes(plan, n).steps for n, _ in family]
     limits = _limits(few.noise, plan.pixel_format, steps, math.inf, 0.0, s.phase.systematic_rad, s)
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
-    return Way(
+    levels = np.quantile(few.background, (0.1, 0.5, 0.9)).astype(np.float32)
+    way = Way(
         frames, g, few.noise, (), table, _sets(family, steps, plan.pixel_format, few.background), limits,
         _depths(table, rig, camera, s), bounds, np.ones((2, 2)),
     )  # fmt: skip
+    return way, levels
 
 
 def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
