@@ -5,7 +5,7 @@ however many there are; and packed, 12 bits each (GenICam's 12p: the lowest bits
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types
+from numba import carray, errors, njit, types
 from numba.extending import intrinsic
 
 from fringescope.threads import by_rows
@@ -32,6 +32,9 @@ def unowned(_typing: Any, array: Any) -> Any:
     """The same array without a share in its ownership, and so all slices of it: counting the owners of each slice
     costs, most where threads count in one place. The caller holds the array.
     """
+
+    if not isinstance(array, types.Array):
+        raise errors.TypingError(f"{array} is no array")
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         nobody = context.get_constant_null(types.MemInfoPointer(signature.return_type.dtype))

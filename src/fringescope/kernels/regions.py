@@ -7,6 +7,7 @@ from numba import njit
 
 from fringescope.kernels.domains import label_of
 from fringescope.kernels.links import largest_step, linked, spread
+from fringescope.kernels.raw import unowned
 from fringescope.kernels.tiles import TILE
 from fringescope.threads import by_rows
 
@@ -19,6 +20,8 @@ def gradient_signs(first, last, phase, sigma, reasons, asked, field, reach, sign
     on one where the other is masked; it must exceed `significance` standard deviations to count. Only the pixels of
     tiles that are `asked` (see `tiles.py`) are looked at; `backward` gets the tiles that have a sign of -1.
     """
+    phase, sigma, reasons = unowned(phase), unowned(sigma), unowned(reasons)
+    asked, out, backward = unowned(asked), unowned(out), unowned(backward)
     H, W = phase.shape
     for t in range(first, last):
         for u in range(asked.shape[1]):
@@ -80,6 +83,8 @@ def mark_loose(first, last, phase, sigma, reasons, asked, field, factor, floor, 
     At the image border the same share of those inside counts. The eight at distance two may stand in for the next
     ones: on a Bayer sensor these are of the pixel's own colour, and often the only ones with enough light.
     """
+    phase, sigma = unowned(phase), unowned(sigma)
+    reasons, asked = unowned(reasons), unowned(asked)
     H, W = phase.shape
     others = ~pending
     for t in range(first, last):
@@ -261,6 +266,8 @@ def mark_off_surface(first, last, phase, sigma, node, label, kind, asked, radius
     the yardstick. Pixels that are not `asked` (see `screens.rough_pixels`) are taken as lying on it. `measures` (2, H,
     W), if it is not empty, gets both figures, NaN where there is none.
     """
+    phase, sigma = unowned(phase), unowned(sigma)
+    node, label, reasons = unowned(node), unowned(label), unowned(reasons)
     W = phase.shape[1]
     room = np.empty((5, (2 * radius + 1) ** 2))
     M = np.empty((7, 6))

@@ -8,6 +8,7 @@ into vector instructions; arrays and scalars only.
 import numpy as np
 from numba import njit
 
+from fringescope.kernels.raw import unowned
 from fringescope.kernels.tiles import TILE
 from fringescope.threads import by_rows
 
@@ -233,6 +234,7 @@ def rough_pixels(first, last, phase, sigma, reasons, kind, step, limit, wide_lim
     picture; VOID, all masked; or MIXED. In calm tiles each neighbour is held against its own neighbours, which takes
     fewer sums, and the surface against its cubic terms.
     """
+    phase, sigma, reasons, kind, ask = unowned(phase), unowned(sigma), unowned(reasons), unowned(kind), unowned(ask)
     H, W = phase.shape
     room, mask = np.empty((11, BLOCK + 8), np.float32), np.empty(BLOCK + 4, np.uint16)
     around, own = np.empty((TILE + 4, BLOCK), np.float32), np.empty((TILE + 4, BLOCK + 4), np.float32)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from fringescope.kernels.links import spread
+from fringescope.kernels.raw import unowned
 from fringescope.threads import by_rows
 
 TILE = 8  #: pixels along a side
@@ -74,6 +75,7 @@ def steps(first, last, phase, asked, out):
     `out` (6, h, w). Steps from a tile's last pixels to the next tile's first ones are among them. Without a step:
     inf, -inf. Where a phase is missing: -inf, inf for the steps. Only the `asked` tiles (h, w) are written.
     """
+    phase, out = unowned(phase), unowned(out)
     H, W = phase.shape
     low, high = np.empty((3, _BLOCK), np.float32), np.empty((3, _BLOCK), np.float32)
     total = np.empty((3, _BLOCK), np.float32)
@@ -147,6 +149,7 @@ def growing(first, last, steps, whole, field, height, width, reach, out):
 @by_rows(lambda _reasons, _bits, out: out.shape[0])
 def cover(first, last, reasons, bits, out):
     """Whether each tile (h, w) is MIXED, WHOLE (no pixel has one of the reasons `bits`) or VOID (all have)."""
+    reasons, out = unowned(reasons), unowned(out)
     H, W = reasons.shape
     some, none = np.empty(W, np.uint16), np.empty(W, np.uint16)
     for t in range(first, last):

@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
+from fringescope.kernels.raw import unowned
 from fringescope.kernels.tiles import TILE, among
 from fringescope.threads import by_rows
 
@@ -80,6 +81,7 @@ def torn(first, last, phase, sigma, most, reasons, weak, radius, range_, looked,
     the own order. A
     pixel votes if its `sigma` is below `most`; one that does not, and is `weak` by its reasons, does not matter.
     """
+    phase, sigma, reasons = unowned(phase), unowned(sigma), unowned(reasons)
     H, W = phase.shape
     low, high = np.empty(_BLOCK + 2 * radius, np.float32), np.empty(_BLOCK + 2 * radius, np.float32)
     least, greatest = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
@@ -176,6 +178,8 @@ def poll(first, last, phase, sigma, most, doubt, asked, looked, radius, least, m
     order, CONFIRMED where the majority is for the own order, SPLIT where no order has the majority, 0 where too few
     voted; it stays what it was where nobody asked.
     """
+    phase, sigma = unowned(phase), unowned(sigma)
+    doubt, changed = unowned(doubt), unowned(changed)
     H, W = phase.shape
     counts = np.zeros(2 * MOST + 1, np.int64)
     for t in range(first, last):
