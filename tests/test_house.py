@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer.main
 
 from fringescope import cli, geometry, store
 from fringescope.settings import describe
@@ -40,14 +39,15 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "errors": (set(), "the bottom"),
     "types": ({"errors"}, "data, no behaviour"),
     "settings": ({"errors"}, "data, no behaviour"),
-    "threads": (set(), "rows on all cores: knows nothing of what the rows hold"),
+    "jit": (set(), "kernels out of Numba's cache: knows nothing of what they do"),
+    "threads": ({"jit"}, "rows on all cores: knows nothing of what the rows hold"),
     "gpu": ({"threads"}, "slabs of rows through a GPU: knows nothing of what the rows hold"),
     "memory": (set(), "large arrays used again: knows nothing of what they hold"),
-    "kernels": ({"threads"}, "arrays in, arrays out: they know no dataclass, file or device"),
+    "kernels": ({"threads", "jit"}, "arrays in, arrays out: they know no dataclass, file or device"),
     "geometry": (DATA | {"kernels"}, "poses and lenses on top of the lens kernels"),
     "calm": (DATA | {"kernels", "threads", "memory"}, "tiles of an image that need no closer look, for any stage"),
     **dict.fromkeys(STAGES, (BOTTOM, "stages never import each other: what passes between them is a type")),
-    "twin": (DATA | {"threads"}, "the judge shares no maths with the judged"),
+    "twin": (DATA | {"threads", "jit"}, "the judge shares no maths with the judged"),
     "devices": (DATA, "a device knows what it is asked, not who asks"),
     "devices.simulated": (DATA | {"twin"}, "the twin posing as devices"),
     "devices.replay": (DATA | {"store"}, "a stored capture posing as devices"),
@@ -70,7 +70,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 #: Packages that only some units may import, and which.
 CONFINED = {
-    "numba": {"kernels", "threads", "twin", "gpu"},
+    "numba": {"kernels", "jit", "gpu"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"report", "evaluate"},
@@ -81,7 +81,7 @@ CONFINED = {
     "http": {"server", "cli"},
     "urllib": {"devices", "server"},
     "requests": set(),
-    "pickle": set(),
+    "pickle": {"jit"},
 }
 
 
@@ -287,7 +287,7 @@ def test_reference_pages_say_what_the_code_says(page: str) -> None:
 
 def cli_verbs() -> dict[str, set[str]]:
     """Every command with the options that it takes."""
-    commands = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+    commands = cli.whole().commands
     return {name: {o for p in c.params for o in (*p.opts, *p.secondary_opts)} for name, c in commands.items()}
 
 

@@ -77,11 +77,9 @@ def _option(parameter: Any) -> tuple[str, str]:
 
 def commands_page() -> str:
     """Every verb of the command line with its arguments and options."""
-    import typer.main
+    from fringescope.cli import whole
 
-    from fringescope.cli import app
-
-    root = typer.main.get_command(app)
+    root = whole()
     lines = [
         "# Commands",
         "",
@@ -90,7 +88,7 @@ def commands_page() -> str:
         "",
         "This page is made from `cli.py` by `make reference`.",
     ]
-    for name, command in sorted(root.commands.items()):  # type: ignore[attr-defined]
+    for name, command in sorted(root.commands.items()):
         if command.hidden:
             continue
         help_text = "\n".join(line.strip() for line in (command.help or "").strip().splitlines())

@@ -11,8 +11,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import yaml
-
 from fringescope.errors import UsageError
 
 
@@ -295,6 +293,8 @@ def from_dict(d: Mapping[str, Any], base: Settings | None = None) -> Settings:
 
 def to_yaml(s: Settings) -> str:
     """The tree as YAML, every field with its unit and meaning as a comment."""
+    import yaml
+
     lines: list[str] = []
     current = ""
     for section, f, value in describe(s):
@@ -309,6 +309,8 @@ def to_yaml(s: Settings) -> str:
 
 def from_yaml(text: str, base: Settings | None = None) -> Settings:
     """Settings from YAML text. Raises UsageError as `from_dict`, and for text that is not YAML."""
+    import yaml  # who changes no setting does without it
+
     try:
         d = yaml.safe_load(text)
     except yaml.YAMLError as e:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import importlib
 import os
 import signal
 import sys
@@ -11,13 +13,92 @@ from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.core
+import typer.main
 
 from fringescope import __version__
 from fringescope.cli.common import INTERRUPTED
 from fringescope.errors import FringescopeError, UsageError
 
+#: verb -> the module that defines it, imported when the verb is called; how its help begins
+VERBS: dict[str, tuple[str, str]] = {
+    "board": (
+        "boards",
+        "A calibration board to print at true scale, with measuring bars and its board.json beside it.",
+    ),
+    "calibrate": ("calibrating", "Board captures to a calibrated rig, with the evidence to trust it."),
+    "verify": ("calibrating", "Is this rig still true? Judged from one capture, with or without a board."),
+    "simulate": ("capturing", "A capture of the simulated instrument, with its exact truth in truth/."),
+    "import": (
+        "capturing",
+        "Somebody's loose images, or a TIFF stack, to a capture, with a preview and a proof that the order is right.",
+    ),
+    "patterns": (
+        "capturing",
+        "The images to project for a rig, as the device needs them, with the plan that they follow.",
+    ),
+    "devices": ("capturing", "The devices that can be opened, by URI."),
+    "settings": ("capturing", "Every threshold with its value, unit and meaning, as the YAML that --settings takes."),
+    "response": (
+        "responding",
+        "Measures the response of projector and camera (gamma, saturation) and tells whether phases "
+        "need its correction.",
+    ),
+    "reconstruct": (
+        "scanning",
+        "Fringe images to a clean, coloured, fused surface: scan.json, cloud.ply, surface.glb.",
+    ),
+    "decode": (
+        "scanning",
+        "Phase, modulation, background, projector coordinates and reasons per pixel, without a rig.",
+    ),
+    "evaluate": (
+        "scanning",
+        "Fits a plane or spheres and tells how good the points are, as in section IV of the paper.",
+    ),
+    "export": (
+        "scanning",
+        "A scan in other people's formats: the surface (stl, obj, 3mf, glb) or the points (pcd, e57, ply), in mm.",
+    ),
+    "demo": (
+        "showing",
+        "The simulated instrument scans a wet specimen: capture, scan, error map against the truth, "
+        "rendered pictures.",
+    ),
+    "bench": (
+        "timing",
+        "Times a scan against a plain copy of the same memory and against other decoders, all in one run.",
+    ),
+    "warmup": ("timing", "Compiles the kernels for this processor now, so that no scan need; they are kept on disk."),
+}
+
+
+class _Verbs(typer.core.TyperGroup):
+    """The verbs; each is imported when it is asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - as in the class above
+        return list(VERBS)
+
+    def get_command(self, ctx: Any, name: str) -> Any:  # noqa: ARG002
+        if name in VERBS and name not in self.commands:
+            importlib.import_module(f"fringescope.cli.{VERBS[name][0]}")
+            one = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+            one.registered_commands = [i for i in app.registered_commands if _name(i) == name]
+            self.commands[name] = typer.main.get_command(one)
+        return self.commands.get(name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        stubs: dict[str, Any] = {name: typer.core.TyperCommand(name, help=text) for name, (_, text) in VERBS.items()}
+        typer.core.TyperGroup(name=self.name, commands=stubs).format_commands(ctx, formatter)
+
+
+def _name(info: Any) -> str:
+    return str(info.name or info.callback.__name__)
+
+
 app = typer.Typer(
     name="fringescope",
+    cls=_Verbs,
     help="Structured-light 3D imaging of tissue: fringe images to a clean, coloured surface.",
     no_args_is_help=True,
     add_completion=False,
@@ -28,6 +109,14 @@ app = typer.Typer(
 
 #: What the framework raises for a wrong command line, whichever library it builds on.
 _ClickError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+
+def whole() -> Any:
+    """The command with every verb in its `commands`, for who writes or reads its pages."""
+    group: Any = typer.main.get_command(app)
+    for name in VERBS:
+        group.get_command(None, name)
+    return group
 
 
 def _version(wanted: bool) -> None:
@@ -96,6 +185,10 @@ def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
 
 def main() -> NoReturn:
     """The console script."""
+    gc.set_threshold(20_000)  # most of what is made at first stays: it need not be looked through again and again
+    sys.setswitchinterval(1e-3)  # who waits for the interpreter while a module is imported has little to do in it
     for number in (signal.SIGINT, signal.SIGTERM):  # either way temporary folders go
         signal.signal(number, _interrupt)
-    sys.exit(run(sys.argv[1:]))
+    status = run(sys.argv[1:])
+    gc.freeze()  # nor when all of it goes
+    sys.exit(status)

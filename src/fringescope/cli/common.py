@@ -12,7 +12,6 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
 import typer
-import yaml
 
 from fringescope import settings as tree
 from fringescope.errors import CaptureError, UsageError
@@ -66,6 +65,8 @@ def load_settings(file: Path | None, changes: Iterable[str] | None) -> tree.Sett
         section, dot, name = key.strip().partition(".")
         if not (eq and dot and section and name):
             raise UsageError(f"--set {change}; needed SECTION.NAME=VALUE, as in denoise.min_modulation=5")
+        import yaml
+
         try:
             parsed = yaml.safe_load(value)
         except yaml.YAMLError as e:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,14 +57,22 @@ def scan_into(
     """Reconstructs a capture (of some cameras `only`) and writes the scan into a folder that is being made; returns it
     with its scan.json.
     """
-    from fringescope import export, pipeline, store
+    from fringescope import store
     from fringescope.settings import to_dict
 
-    where = pipeline.check_device(device)
+    if device != "cpu":
+        from fringescope import pipeline
+
+        pipeline.check_device(device)
     c = picked(store.read_capture(capture), only)
-    r = store.read_rig(rig)
+    with ThreadPoolExecutor(1) as aside:
+        reading = aside.submit(store.read_rig, rig)
+        views = store.view_inputs(c, load_response(response), ahead=True)
+        from fringescope import export, pipeline  # while rig and frames are read: this takes longest
+
+        r = reading.result()
     store.check_rig(c, r)
-    views = store.view_inputs(c, load_response(response))
+    where = pipeline.check_device(device)
     scan = pipeline.scan(views, r, s, all_points=all_points, device=where, progress=progress.share)
     if preview and scan.preview is not None:
         page = export.viewer_page(scan.preview, title=folder_title(capture))

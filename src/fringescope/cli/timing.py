@@ -60,7 +60,7 @@ def warmup(json: Json = False) -> None:
         def work() -> int:
             from fringescope.warmup import compile_kernels
 
-            return compile_kernels()
+            return compile_kernels(every_plan=True)
 
         points = progress.run("compiling", work)
     seconds = perf_counter() - start

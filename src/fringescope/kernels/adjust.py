@@ -10,8 +10,8 @@ half diagonal. Lenses are the ten numbers of `kernels.lens`; derivatives are by 
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.lens import distort_jacobian, from_plane
 
 

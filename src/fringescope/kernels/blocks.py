@@ -6,8 +6,8 @@ Blocks are BLOCK pixels of a row at most, of which `n` count; arrays (BLOCK,) fl
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.pixel import fitted, judged, of_eight, of_four, of_three, weak, weighed
 from fringescope.kernels.raw import samples_at, unpack
 from fringescope.kernels.sinusoid import follow, left_over

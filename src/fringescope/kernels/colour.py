@@ -6,8 +6,8 @@ Arrays and scalars only; pictures (H, W, 3) float32, linear light 0..1.
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 GAP = 3  #: pixels around a gap in the blending that tell what blending does there

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 TERMS = 14  #: place (2), two edge angles, blur, offset polynomial (6), contrast polynomial (3)

@@ -13,8 +13,8 @@ at infinity: triangles that have it lie beyond the hull, so that every edge has 
 """
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 OUT = -1  #: the vertex at infinity

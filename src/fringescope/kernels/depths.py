@@ -6,8 +6,8 @@ In float32, in loops that compilers turn into vector instructions; `fused.py` ca
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.blocks import COUNT
 from fringescope.kernels.pixel import is_inside, point
 from fringescope.kernels.raw import unowned

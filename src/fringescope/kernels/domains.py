@@ -5,8 +5,8 @@ Bands of tiles are linked by themselves, on all cores, then band to band. Arrays
 """
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.links import largest_step, linked
 from fringescope.kernels.tiles import TILE
 

@@ -8,8 +8,8 @@ pixel, and depth. Bands of rows are drawn in parallel, each by one thread, so th
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 BANDS = 16

@@ -6,8 +6,8 @@ Arrays and scalars only. Angles in radians; intensities in codes; coordinates in
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.sinusoid import ROUNDING, TWO_PI, follow, left_over, phase_variance, turns
 from fringescope.threads import by_rows
 

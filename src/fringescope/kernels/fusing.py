@@ -8,8 +8,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.colour import codes_of, encode_row
 from fringescope.kernels.surface import CODE, locate
 from fringescope.kernels.views import nearest, pick, project

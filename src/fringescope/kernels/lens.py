@@ -6,8 +6,8 @@ A lens travels as one float64 vector of ten numbers: fx, fy, u0, v0, skew, k1, k
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 

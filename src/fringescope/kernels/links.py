@@ -2,7 +2,7 @@
 
 import math
 
-from numba import njit
+from fringescope.jit import njit
 
 
 @njit(cache=True, inline="always", error_model="numpy")

@@ -6,8 +6,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 

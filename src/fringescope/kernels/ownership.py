@@ -1,8 +1,8 @@
 """Loops that settle who owns a place: owners of cells, marks of pixels, doubles. Arrays and scalars only."""
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.surface import locate
 from fringescope.kernels.views import split
 from fringescope.threads import by_rows

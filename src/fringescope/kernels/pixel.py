@@ -6,8 +6,8 @@ codes.
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.lens import to_plane
 from fringescope.kernels.sinusoid import ROUNDING, phase_variance, turns
 

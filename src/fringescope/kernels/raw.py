@@ -5,9 +5,10 @@ however many there are; and packed, 12 bits each (GenICam's 12p: the lowest bits
 from typing import Any
 
 import numpy as np
-from numba import carray, errors, njit, types
+from numba import carray, errors, types
 from numba.extending import intrinsic
 
+from fringescope.jit import njit
 from fringescope.threads import by_rows
 
 

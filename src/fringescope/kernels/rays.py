@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.lens import distort_jacobian, from_plane, to_plane
 from fringescope.threads import by_rows
 

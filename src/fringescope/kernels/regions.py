@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.domains import label_of
 from fringescope.kernels.links import largest_step, linked, spread
 from fringescope.kernels.raw import unowned

@@ -6,8 +6,8 @@ into vector instructions; arrays and scalars only.
 """
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.raw import unowned
 from fringescope.kernels.tiles import TILE
 from fringescope.threads import by_rows

@@ -5,8 +5,9 @@ float32. Phases are in turns (1 = one period), so that quadrants are exact in ei
 import math
 
 import numpy as np
-from numba import njit
 from numba.extending import overload
+
+from fringescope.jit import njit
 
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1.0 / 12.0  #: least variance of a sample, codes squared

@@ -4,7 +4,8 @@ Arrays and scalars only.
 """
 
 import numpy as np
-from numba import njit
+
+from fringescope.jit import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -7,8 +7,8 @@ whole and no jump in it, come from loops that compilers turn into vector instruc
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.views import split
 from fringescope.threads import by_rows
 

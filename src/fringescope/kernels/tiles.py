@@ -6,8 +6,8 @@ Most of a surface is calm: there the masks of `regions.py` need not look at sing
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.links import spread
 from fringescope.kernels.raw import unowned
 from fringescope.threads import by_rows

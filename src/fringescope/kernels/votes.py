@@ -7,8 +7,8 @@ nothing.
 import math
 
 import numpy as np
-from numba import njit
 
+from fringescope.jit import njit
 from fringescope.kernels.raw import unowned
 from fringescope.kernels.tiles import TILE, among
 from fringescope.threads import by_rows

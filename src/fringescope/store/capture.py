@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -35,6 +36,8 @@ from fringescope.types import (
 
 FORMAT, VERSION = "fringescope-capture", 1
 LEAST_CYCLES = 1e-9  #: per projector-plane unit; less is no fringe
+LITTLE = 50_000_000  #: pixels of all frames of a capture that may be read ahead
+READERS = 4  #: threads that do it
 LEAST_SIDE = 2  #: rows and columns of a frame: a pixel is judged by its neighbours
 
 
@@ -128,17 +131,27 @@ class Frames:
 
     def __init__(self, capture: Capture, view: CaptureView) -> None:
         self._capture, self._view = capture, view
+        self._ahead: list[Future[AnyArray]] = []
 
     def __len__(self) -> int:
         return len(self._view.files)
 
     def __iter__(self) -> Iterator[tuple[FrameKey, AnyArray]]:
         images = Images(self._capture.folder)  # its own, so that views may be read in parallel
-        view = self._view
-        for key, name in zip(view.plan.keys, view.files, strict=True):
-            frame = images.frame(name, view.plan.pixel_format, view.size)
-            self._capture.images.digests.update(images.digests)
-            yield key, frame
+        view, ahead, self._ahead = self._view, self._ahead, []
+        for n, (key, name) in enumerate(zip(view.plan.keys, view.files, strict=True)):
+            yield key, ahead[n].result() if ahead else self._read(name, images)
+
+    def _read(self, name: str, images: Images) -> AnyArray:
+        frame = images.frame(name, self._view.plan.pixel_format, self._view.size)
+        self._capture.images.digests.update(images.digests)
+        return frame
+
+    def read_ahead(self, pool: Executor) -> None:
+        """Let the pool read the frames for the next who iterates, who gets its errors; pages of a TIFF it leaves."""
+        if not self._ahead and all(split_page(name)[1] is None for name in self._view.files):
+            folder = self._capture.folder
+            self._ahead = [pool.submit(self._read, name, Images(folder)) for name in self._view.files]
 
     def __getitem__(self, key: FrameKey) -> AnyArray:
         view, images = self._view, Images(self._capture.folder)
@@ -265,16 +278,23 @@ def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
     return FringeSet((g[0], g[1]), steps, s.exposure_us), list(s.frames)
 
 
-def view_inputs(capture: Capture, response: Response | None = None) -> tuple[ViewInput, ...]:
+def view_inputs(capture: Capture, response: Response | None = None, *, ahead: bool = False) -> tuple[ViewInput, ...]:
     """What the pipeline takes: per view its plan, its frames (read lazily, may be iterated again) and its picture.
 
-    `response` is the one that all views are to be freed from.
+    `response` is the one that all views are to be freed from. `ahead` has the frames of a little capture read by other
+    threads from now on, in place of when they are asked for.
     The ring-light picture is read at once. Raises CaptureError here, or while frames are read, naming the file.
     """
+    frames = {v.camera: Frames(capture, v) for v in capture.views}
+    if ahead and sum(len(v.files) * math.prod(v.size) for v in capture.views) <= LITTLE:
+        pool = ThreadPoolExecutor(READERS)
+        for one in frames.values():
+            one.read_ahead(pool)
+        pool.shutdown(wait=False)
     out = []
     for v in capture.views:
         color = None if v.color is None else capture.images.frame(v.color, v.plan.pixel_format, v.size)
-        out.append(ViewInput(v.plan, Frames(capture, v), color, v.noise, response))
+        out.append(ViewInput(v.plan, frames[v.camera], color, v.noise, response))
     return tuple(out)
 
 

@@ -18,6 +18,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -115,6 +116,7 @@ def _let_go(fd: int | None) -> None:
         os.close(fd)
 
 
+SYNCS = 8  #: files that are written out at once
 FRESH_S = 5.0  #: work this young may not have its lock yet
 
 
@@ -172,9 +174,8 @@ def new_folder(path: Path | str, *, marker: str, force: bool = False) -> Iterato
             work = Path(tempfile.mkdtemp(prefix=f".{target.name[:80]}.", suffix=".part", dir=target.parent))
             held = _hold(work)
             yield work
-            for f in sorted(work.rglob("*")):
-                if f.is_file():
-                    _sync(f)
+            with ThreadPoolExecutor(SYNCS) as pool:  # a disk is waited for once, not file by file
+                list(pool.map(_sync, (f for f in sorted(work.rglob("*")) if f.is_file())))
             work.chmod(_umask_mode(0o777))
             _sync_folder(work)
             _check_target_folder(path, marker, force)  # somebody may have written there meanwhile

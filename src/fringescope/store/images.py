@@ -18,14 +18,16 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
-import tifffile
 
 from fringescope.errors import CaptureError
 from fringescope.types import AnyArray, PixelFormat
+
+if TYPE_CHECKING:  # most frames are PNG
+    import tifffile
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
@@ -181,6 +183,8 @@ class Images:
         return check_frame(self.raw(name), pixel_format, size, str(path))
 
     def _page(self, file: str, page: int | None, data: bytes | None = None) -> tifffile.TiffPage:
+        import tifffile
+
         path = self.folder / file
         if self._stack is None or self._stack[0] != file:
             try:
@@ -213,6 +217,8 @@ def stack_axes(path: Path) -> tuple[dict[str, int], int]:
 
     Raises CaptureError if it is no TIFF.
     """
+    import tifffile
+
     _regular(path)
     try:
         with _strict(), tifffile.TiffFile(path) as tif:
@@ -263,6 +269,8 @@ def _lzw(page: tifffile.TiffPage) -> AnyArray:
 
 
 def _tiff_array(page: tifffile.TiffPage, path: Path, kinds: str = "u") -> AnyArray:
+    import tifffile
+
     head = _tiff_header(page, path, kinds)
     try:
         with _strict():
@@ -362,6 +370,8 @@ def write_png(path: Path, a: AnyArray, level: int = 1) -> None:
 
 def write_tiff(path: Path, a: AnyArray) -> None:
     """(H, W) or (H, W, 3) float32 or integers as an uncompressed TIFF. Raises OSError if it cannot be written."""
+    import tifffile
+
     buf = io.BytesIO()
     tifffile.imwrite(
         buf,

@@ -10,6 +10,7 @@ import datetime
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from fringescope.types import F32, U8, U16, Cloud, Decoded, Grid, Reason, Scan, 
 
 FORMAT, VERSION = "fringescope-scan", 1
 DECODED_FORMAT, DECODED_VERSION = "fringescope-decoded", 1
+
+WRITERS = 4  #: files that are written at once
 
 WritePly = Callable[[Cloud, Path], None]
 WriteGlb = Callable[[Surface, Path, Mapping[str, Any]], None]
@@ -101,24 +104,28 @@ def put_scan(
     of capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
     """
     cloud = scan.cloud if scan.all_points is None else scan.all_points
-    write_ply(cloud, folder / "cloud.ply")
-    identity = {
-        "capture": capture_hash,
-        "rig": rig_hash,
-        "settings": plain(settings),
-        "software": __version__,
-        "cloud": _sha256(folder / "cloud.ply"),
-    }
-    hash_ = files.canonical_hash(identity)
-    extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
-    if scan.surface is not None:
-        write_glb(scan.surface, folder / "surface.glb", extras)
     preview = scan.preview if write_preview else None
-    if preview is not None and write_preview is not None:
-        write_preview(preview, folder / "preview.glb", extras)
-    for g in scan.grids:
-        _put_grid(folder / g.camera, g, grids)
-    digests = {str(p.relative_to(folder).as_posix()): _sha256(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+    with ThreadPoolExecutor(WRITERS) as pool:
+        tasks = [pool.submit(_put_grid, folder / g.camera, g, grids) for g in scan.grids]
+        write_ply(cloud, folder / "cloud.ply")
+        identity = {
+            "capture": capture_hash,
+            "rig": rig_hash,
+            "settings": plain(settings),
+            "software": __version__,
+            "cloud": _sha256(folder / "cloud.ply"),
+        }
+        hash_ = files.canonical_hash(identity)
+        extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
+        if scan.surface is not None:
+            tasks.append(pool.submit(write_glb, scan.surface, folder / "surface.glb", extras))
+        if preview is not None and write_preview is not None:
+            tasks.append(pool.submit(write_preview, preview, folder / "preview.glb", extras))
+        for task in tasks:
+            task.result()
+        written = [p for p in sorted(folder.rglob("*")) if p.is_file()]
+        names = [str(p.relative_to(folder).as_posix()) for p in written]
+        digests = dict(zip(names, pool.map(_sha256, written), strict=True))
     verdicts = {v.camera: plain(v) for v in scan.verdicts}
     doc = {
         "format": FORMAT,
