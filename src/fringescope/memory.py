@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 SMALL = 1 << 20  #: bytes below which the system's allocator is as good
 STEP = 1 << 21  #: sizes are rounded up to so many bytes, a huge page
 WASTE = 1.25  #: a block is not used for less than its size over this
-KEPT = 3 << 30  #: bytes that lie idle at most
+MOST_KEPT = 3 << 30  #: bytes that may lie idle; a quarter of the machine's memory where that is less
 
 _idle: list[NDArray[np.uint8]] = []
 _lock = threading.RLock()  # a collector may run `_Loan.__del__` within `_take`
@@ -68,10 +68,25 @@ def release() -> None:
 
 def available() -> int | None:
     """Bytes that can be had without driving anything out of memory, idle blocks of ours included; None: unknown."""
-    try:
-        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
-        free = int(lines["MemAvailable"].split()[0]) * 1024
-    except (OSError, KeyError, ValueError):
+    free = _told("MemAvailable")
+    if free is None:
         return None
     with _lock:
         return free + sum(one.nbytes for one in _idle)
+
+
+def _told(what: str) -> int | None:
+    """Bytes, as the system tells them; None where it does not."""
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
+        return int(lines[what].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return None
+
+
+def _kept() -> int:
+    total = _told("MemTotal")
+    return MOST_KEPT if total is None else min(MOST_KEPT, total // 4)
+
+
+KEPT = _kept()  #: bytes that lie idle at most
