@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fringescope import geometry
+from fringescope import geometry, memory
 from fringescope.errors import EmptyResultError
 from fringescope.fuse.delaunay import Triangulation, along_curve, snapped
 from fringescope.fuse.levels import Sheet, removable, simplify
@@ -55,20 +55,27 @@ class _Points:
 def _points(fused: Fused, rig: Rig, s: MeshSettings) -> _Points:
     """Owned points, strided where there are more than `max_points`."""
     stride = max(1, math.ceil(math.sqrt(len(fused.cloud) / s.max_points)))
-    parts: list[tuple[AnyArray, ...]] = []
-    first = 0
-    for i, (grid, marks) in enumerate(zip(fused.grids, fused.marks, strict=True)):
+
+    def numbered(marks: U8) -> tuple[I64, int]:
         at = np.empty((-(-marks.shape[0] // stride), -(-marks.shape[1] // stride)), np.int64)
-        first = number(marks, OWNED, stride, first, at)
-        rows, cols = (a.astype(np.int32) * np.int32(stride) for a in np.nonzero(at >= 0))
-        at = at[at >= 0]
+        return at, number(marks, OWNED, stride, 0, at)
+
+    def of_view(i: int, numbers: I64, first: int) -> tuple[AnyArray, ...]:
+        grid = fused.grids[i]
+        rows, cols = (a.astype(np.int32) * np.int32(stride) for a in np.nonzero(numbers >= 0))
+        at = numbers[numbers >= 0] + first
         xyz, normal = (np.take(x, at, axis=0) for x in (fused.cloud.xyz, fused.cloud.normals))
         camera = rig.cameras[grid.view]
         reach = np.empty(len(at), np.float32)
         pixel_rad = stride / math.sqrt(camera.lens.K[0, 0] * camera.lens.K[1, 1])
         k.sampling(xyz, normal, geometry.centre(camera.pose), pixel_rad, reach)
-        parts.append((xyz, normal, np.take(fused.cloud.sigma, at), reach, np.full(len(at), i, np.uint8),
-                      np.take(fused.seen, at), np.stack([cols, rows], axis=1)))
+        return (xyz, normal, np.take(fused.cloud.sigma, at), reach, np.full(len(at), i, np.uint8),
+                np.take(fused.seen, at), np.stack([cols, rows], axis=1))
+
+    with ThreadPoolExecutor(len(fused.grids)) as pool:
+        numbers, counts = zip(*pool.map(numbered, fused.marks), strict=True)
+        firsts = np.cumsum((0, *counts[:-1])).tolist()
+        parts = list(pool.map(of_view, range(len(fused.grids)), numbers, firsts))
     xyz, normal, sigma, reach, owner, seen, pixel = (np.concatenate(column) for column in zip(*parts, strict=True))
     q = geometry.transform(rig.projector.pose, xyz)
     ab = snapped(q[:, :2] / q[:, 2:])
@@ -193,7 +200,10 @@ def _crop(view: int, uv: Sequence[F64], fused: Fused) -> tuple[NDArray[np.int_],
     low = np.floor(np.min([[x[:, 0].min(), x[:, 1].min()] for x in uv], axis=0)).astype(int) - _MARGIN
     high = np.ceil(np.max([[x[:, 0].max(), x[:, 1].max()] for x in uv], axis=0)).astype(int) + _MARGIN + 1
     low, high = np.maximum(low, 0), np.minimum(high, [W, H])
-    return low, high, np.ascontiguousarray(fused.pictures[view][low[1] : high[1], low[0] : high[0]])
+    part = fused.pictures[view][low[1] : high[1], low[0] : high[0]]
+    texture = memory.empty(part.shape, np.uint8)
+    np.copyto(texture, part)
+    return low, high, texture
 
 
 def _assemble(levels: Sequence[I32], p: _Points, fused: Fused, rig: Rig) -> tuple[Surface, ...]:

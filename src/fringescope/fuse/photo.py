@@ -49,11 +49,12 @@ def _samples(raw: AnyArray, pixel_format: PixelFormat, camera: str) -> AnyArray:
 
 
 def _light(samples: AnyArray, pixel_format: PixelFormat, s: FuseSettings) -> F32:
-    """Codes (H, W, 3 or 1) to linear light (H, W, 3), 0..1 of full scale, white-balanced."""
-    white = [s.white_red, 1.0, s.white_blue] if pixel_format.is_colour else [1.0, 1.0, 1.0]
-    out = memory.empty((*samples.shape[:2], 3), np.float32)
+    """Codes (H, W, 3 or 1) to linear light (H, W, 3), 0..1 of full scale, white-balanced; grey is one channel thrice.
+    """
+    white = [s.white_red, 1.0, s.white_blue] if pixel_format.is_colour else [1.0]
+    out = memory.empty((*samples.shape[:2], len(white)), np.float32)
     k.scale(constant(samples), (np.array(white) / pixel_format.max_value).astype(np.float32), out)
-    return out
+    return np.broadcast_to(out, (*samples.shape[:2], 3))
 
 
 def photo(raw: AnyArray, pixel_format: PixelFormat, camera: str, s: FuseSettings | None = None) -> Photo:
@@ -99,8 +100,16 @@ def white_gains(white: Photo, region: Bool | None = None) -> tuple[float, float]
     return float(g / r), float(g / b)
 
 
+def samples_of(p: Photo) -> tuple[F32, int]:
+    """A picture's light, flat, as kernels take it, and its channels: 1 where one stands for all three."""
+    channels = 1 if p.rgb.strides[2] == 0 else 3
+    return constant(p.rgb[..., :channels]).reshape(-1), channels
+
+
 def is_grey(p: Photo) -> bool:
     """Whether a picture holds no colour at all, judged by some of its pixels."""
+    if p.rgb.strides[2] == 0:
+        return True
     step = 7 * max(1, int(math.sqrt(p.saturated.size / _FEW)))
     some = p.rgb[::step, ::step]
     return bool((some[..., 0] == some[..., 1]).all() and (some[..., 1] == some[..., 2]).all())

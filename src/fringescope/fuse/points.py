@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 from fringescope import geometry, memory
 from fringescope.errors import EmptyResultError, RigError
 from fringescope.fuse.owners import Raster, bits_of, drop_doubles, raster_of, settle_owners
-from fringescope.fuse.photo import LIGHT, SRGB, is_grey, view_gains
+from fringescope.fuse.photo import LIGHT, SRGB, is_grey, samples_of, view_gains
 from fringescope.kernels import colour as colours
 from fringescope.kernels import fusing, ownership
 from fringescope.kernels import surface as k
@@ -127,15 +128,15 @@ def _spacing(grid: Grid) -> float:
     return float(np.median(found)) if len(found) else 0.0
 
 
-def _side(grid: Grid, photo: Photo, gain: F64, share: float, spacing: float, raster: Raster, there: U8, rig: Rig,
+def _side(grid: Grid, photo: Photo, share: float, spacing: float, raster: Raster, there: U8, rig: Rig,
           s: FuseSettings) -> fusing.Side:
-    """One view as the sums need it: normals, and how weights rise from its borders and jumps."""
+    """One view as the sums need it, not balanced yet: normals, and how weights rise from its borders and jumps."""
     camera = rig.cameras[grid.view]
     H, W = grid.sigma.shape
     hole = max(1.0, 0.5 * s.hole_mm / spacing) if spacing > 0 else 1.0
     width = s.blend_mm / spacing if spacing > 0 else 1.0
     step = max(1, int(min(0.5 * hole, width / 20)))  # what rises over hundreds of pixels needs no value in each
-    squares, code = np.zeros((-(-H // step), -(-W // step)), np.uint8), memory.empty((H, 2 * W), np.int16)
+    squares, code = np.zeros((-(-H // step), -(-W // step)), np.uint8), memory.empty((H, W), np.int32)
     centre = geometry.centre(camera.pose)
     k.survey(*_points(grid), centre, _angle(camera), s.normal_radius, s.max_slope, s.jump_sigma, squares, step,
              raster.vector, code, there)
@@ -146,10 +147,11 @@ def _side(grid: Grid, photo: Photo, gain: F64, share: float, spacing: float, ras
     if photo.saturated.any():
         clear = memory.empty((H, W), np.uint8)
         colours.clearness(constant(photo.saturated), s.highlight_pixels, clear)
+    light, channels = samples_of(photo)
     return fusing.Side(
         constant(grid.xyz).reshape(-1), constant(grid.sigma).reshape(-1), constant(code).reshape(-1),
-        constant(rise).reshape(-1), constant(photo.rgb).reshape(-1), gain.astype(np.float32),
-        constant(clear).reshape(-1), np.float32(share),
+        constant(rise).reshape(-1), light, channels, np.ones(3, np.float32), constant(clear).reshape(-1),
+        np.float32(share),
         centre.astype(np.float32), H, W, geometry.pose_vector(camera.pose), geometry.lens_vector(camera.lens),
     )
 
@@ -195,13 +197,16 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
     s = s or FuseSettings()
     _check(grids, photos, rig)
     V, limits = len(grids), _limits(s)
-    gains = view_gains(grids, photos, rig, s)
-    grey = [is_grey(p) for p in photos]
-    spacings = [_spacing(g) for g in grids]
-    raster = raster_of(grids, spacings, rig, s)
-    there: U8 = np.zeros((V, *raster.shape), np.uint8)
-    sides = [_side(g, p, gains[i], 1e-6 if grey[i] and not all(grey) else 1.0, spacings[i], raster, there[i], rig, s)
-             for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
+    with ThreadPoolExecutor(1) as aside:  # one core's work, while others look for normals
+        balance = aside.submit(view_gains, grids, photos, rig, s)
+        grey = [is_grey(p) for p in photos]
+        spacings = [_spacing(g) for g in grids]
+        raster = raster_of(grids, spacings, rig, s)
+        there: U8 = np.zeros((V, *raster.shape), np.uint8)
+        sides = [_side(g, p, 1e-6 if grey[i] and not all(grey) else 1.0, spacings[i], raster, there[i], rig, s)
+                 for i, (g, p) in enumerate(zip(grids, photos, strict=True))]
+        gains = balance.result()
+    sides = [side._replace(gain=gain.astype(np.float32)) for side, gain in zip(sides, gains, strict=True)]
     owner = settle_owners(sides, limits, raster, there)
     del there
     filled = tuple(sides[min(i, V - 1)] for i in range(MOST))  # always as many, so that one kernel does for any number
@@ -232,8 +237,8 @@ def merge(grids: Sequence[Grid], photos: Sequence[Photo], rig: Rig, s: FuseSetti
         around = cv2.dilate(near[i], np.ones((_NEAR, _NEAR), np.uint8))
         fusing.fuse(filled, V, i, limits, marks[i], fusing.OWNED, around, starts[i], SRGB, xyz, normal, sigma, rgb,
                     seen, pictures[i])
-        colours.fill_gaps(marks[i], fusing.BLENDED, around, fusing.TILE, sides[i].rgb, sides[i].gain, SRGB, LIGHT,
-                         pictures[i])
+        colours.fill_gaps(marks[i], fusing.BLENDED, around, fusing.TILE, sides[i].rgb, sides[i].channels,
+                         sides[i].gain, SRGB, LIGHT, pictures[i])
     view = _views(grids, owned)
     return Fused(Cloud(xyz, normal, rgb, sigma, view), seen, tuple(grids), tuple(marks), tuple(pictures),
                  tuple(spacings), gains)

@@ -23,10 +23,18 @@ def tone(light, table):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _numbers(light, gain, n, out):
-    """Places in a table of 4097 of light times `gain`, clipped to 0..1; NaN is black."""
+def _numbers(light, at, gain, n, out):
+    """Places in a table of 4097 of light, from `at` on, times `gain`, clipped to 0..1; NaN is black."""
     for k in range(n):
-        x = light[k] * gain[k]
+        x = light[at + np.uintp(k)] * gain[k]
+        x = x if x > _ZERO else _ZERO
+        out[k] = np.int32(min(x, _ONE) * _f(4096) + _HALF)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _grey_numbers(light, at, gain, n, out):
+    for k in range(n):
+        x = light[at + np.uintp(k)] * gain
         x = x if x > _ZERO else _ZERO
         out[k] = np.int32(min(x, _ONE) * _f(4096) + _HALF)
 
@@ -47,18 +55,30 @@ def codes_of(light, table, n, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def encode_row(light, factors, table, scratch, out):
-    """A row of a picture (3 W,) to the codes of `table` (4097,).
+def encode_tile(side, top, end, left, right, factors, table, scratch, picture):
+    """A tile of a view's picture (see `fusing.Side`), times its gains, to codes of `table` (4097,) in `picture`, flat.
 
-    `factors` (m,), a multiple of three, are the gains over and over; `scratch` (m,) int32.
+    `factors` are the gains over and over; `scratch` int32, both as long as three rows of the tile.
     """
-    m = len(scratch)
-    for first in range(0, len(light), m):
-        n = min(m, len(light) - first)
-        _numbers(light[first : first + n], factors, n, scratch)
-        part = out[first : first + n]
-        for k in range(n):
-            part[k] = table[np.uintp(scratch[k])]
+    n, gain = right - left, side.gain
+    alike = gain[0] == gain[1] and gain[0] == gain[2]
+    for i in range(top, end):
+        p = np.uintp(i * side.width + left)
+        q = p + p + p
+        if side.channels == 3:
+            _numbers(side.rgb, q, factors, 3 * n, scratch)
+            for k in range(3 * n):
+                picture[q + np.uintp(k)] = table[np.uintp(scratch[k])]
+        elif alike:
+            _grey_numbers(side.rgb, p, gain[0], n, scratch)
+            for k in range(n):
+                code, to = table[np.uintp(scratch[k])], q + np.uintp(3 * k)
+                picture[to] = picture[to + np.uintp(1)] = picture[to + np.uintp(2)] = code
+        else:
+            for c in range(3):
+                _grey_numbers(side.rgb, p, gain[c], n, scratch)
+                for k in range(n):
+                    picture[q + np.uintp(3 * k + c)] = table[np.uintp(scratch[k])]
 
 
 @by_rows(lambda out, *_: out.shape[0])
@@ -82,6 +102,9 @@ def spread(first, last, out, coarse, step):
         for q in range(len(line) - 1):  # from the middle of square q - 1 to that of square q
             begin = math.ceil((q - _HALF) * step - _HALF)
             low, slope = line[q], line[q + 1] - line[q]
+            if slope == _ZERO:
+                row[max(begin, 0) : min(begin + step, W)] = np.uint8(low)
+                continue
             for j in range(max(begin, 0), min(begin + step, W)):
                 row[j] = np.uint8(low + slope * (_f(j) * per + half - _f(q)))
 
@@ -97,12 +120,16 @@ def encode(first, last, light, gain, table, out):
 
 @by_rows(lambda raw, *_: raw.shape[0])
 def scale(first, last, raw, gain, out):
-    """Codes (H, W, 3), or (H, W, 1) for grey, to light: times `gain` (3,) float32."""
-    grey = raw.shape[2] == 1
+    """Codes (H, W, channels) to light: times `gain` (channels,) float32."""
+    channels = raw.shape[2]
     for i in range(first, last):
+        if channels == 1:
+            for j in range(raw.shape[1]):
+                out[i, j, 0] = _f(raw[i, j, 0]) * gain[0]
+            continue
         for j in range(raw.shape[1]):
-            for c in range(3):
-                out[i, j, c] = _f(raw[i, j, 0 if grey else c]) * gain[c]
+            for c in range(channels):
+                out[i, j, c] = _f(raw[i, j, c]) * gain[c]
 
 
 @by_rows(lambda raw, *_: raw.shape[0])
@@ -164,14 +191,14 @@ def clearness(first, last, saturated, width, out):
 
 
 @by_rows(lambda marks, *_: marks.shape[0])
-def fill_gaps(first, last, marks, bit, near, tile, own, gain, codes, light, picture):
+def fill_gaps(first, last, marks, bit, near, tile, own, channels, gain, codes, light, picture):
     """Carry what blending did to a picture into its gaps: pixels where no other view sees the place, but around which
     others do, as single pixels without a point in a highlight. They get their own colour times the ratio of blended to
     own colour around them.
 
     `marks` (H, W) have `bit` where blended; only squares of `tile` pixels that are `near` are looked at. `own`
-    (H * W * 3,) is the view's picture before `gain` (3,); `codes` (4097,) turn light into a picture's codes, `light`
-    (256,) these into light.
+    (H * W * channels,) is the view's picture before `gain` (3,); `codes` (4097,) turn light into a picture's codes,
+    `light` (256,) these into light.
     """
     H, W = marks.shape
     least = int(0.3 * (2 * GAP + 1) * (2 * GAP + 1))
@@ -182,6 +209,11 @@ def fill_gaps(first, last, marks, bit, near, tile, own, gain, codes, light, pict
             if near[i // tile, q] == 0:
                 continue
             left, right = q * tile, min((q + 1) * tile, W)
+            blended = 0
+            for j in range(left, right):
+                blended += 1 if (marks[i, j] & bit) != 0 else 0
+            if blended == right - left:
+                continue
             sums[:] = 0
             for ii in range(top, end):
                 a, b = max(left - GAP, 0), min(right + GAP, W)
@@ -202,9 +234,9 @@ def fill_gaps(first, last, marks, bit, near, tile, own, gain, codes, light, pict
                         for jj in range(max(j - GAP, 0), min(j + GAP + 1, W)):
                             if (marks[ii, jj] & bit) != 0:
                                 after += light[picture[ii, jj, c]]
-                                before += own[3 * (ii * W + jj) + c] * gain[c]
+                                before += own[channels * (ii * W + jj) + c % channels] * gain[c]
                     ratio = min(max(after / max(before, _f(1e-6)), _ZERO), _f(4))
-                    picture[i, j, c] = tone(own[3 * (i * W + j) + c] * gain[c] * ratio, codes)
+                    picture[i, j, c] = tone(own[channels * (i * W + j) + c % channels] * gain[c] * ratio, codes)
 
 
 @by_rows(lambda rows, *_: rows.shape[0])

@@ -1,7 +1,8 @@
 """What other views say about a pixel's ray, and its colour: one pass over the pixels that matter, in blocks.
 
-Of every row the pixels wanted are listed, so that no work goes to others. Arrays and scalars only, in float32, in loops
-that compilers turn into vector instructions; only what lies scattered in other views is fetched pixel by pixel.
+Of each small tile of a picture the pixels wanted are listed, so that no work goes to others, and what is fetched pixel
+by pixel from other views lies close together there too. All else is loops over lists that compilers turn into vector
+instructions. Arrays and scalars only, in float32.
 """
 
 import math
@@ -10,17 +11,20 @@ from typing import NamedTuple
 import numpy as np
 
 from fringescope.jit import njit
-from fringescope.kernels.colour import codes_of, encode_row
+from fringescope.kernels.blending import blend, colours_at, colours_between, taps, tint_weights
+from fringescope.kernels.colour import codes_of, encode_tile
 from fringescope.kernels.surface import CODE, locate
-from fringescope.kernels.views import nearest, pick, project
+from fringescope.kernels.views import places, project
 from fringescope.threads import by_rows
 
-BLOCK = 512  #: pixels that are worked on together
+WIDE, HIGH = 32, 8  #: pixels of a tile that is worked on at a time
+BLOCK = WIDE * HIGH
 OWNED, EDGE, POINT, BLENDED = 1, 2, 4, 8  #: bits of a view's marks
-TILE = 32  #: side, in pixels, of the squares of a picture that are blended or not
+TILE = 32  #: side, in pixels, of the squares of a picture that are blended or not: some tiles
 
 _f = np.float32
 _ZERO, _ONE, _TWO, _THREE = (np.float32(c) for c in (0.0, 1.0, 2.0, 3.0))
+_NAN = np.float32(np.nan)
 _ADD1, _ADD2 = np.uintp(1), np.uintp(2)  # to indices, which are quicker without a sign
 _CONTRACT = {"contract"}
 
@@ -30,9 +34,10 @@ class Side(NamedTuple):
 
     xyz: np.ndarray  #: (H * W * 3,) float32, world mm
     sigma: np.ndarray  #: (H * W,) float32
-    code: np.ndarray  #: (H * W * 2,) int16, normals (see `surface.encode`)
+    code: np.ndarray  #: (H * W,) int32, normals (see `surface.encode`)
     rise: np.ndarray  #: (H * W,) uint8, 0..255 from borders and jumps
-    rgb: np.ndarray  #: (H * W * 3,) float32, linear light
+    rgb: np.ndarray  #: (H * W * channels,) float32, linear light
+    channels: int  #: 3, or 1 of a picture that is grey
     gain: np.ndarray  #: (3,) float32
     clear: np.ndarray  #: (H * W,) uint8, 255 far from saturated pixels; or (1,)
     share: np.float32  #: of a view's colours; little where it has none
@@ -54,56 +59,55 @@ class Limits(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def listed(marks, mask, wanted, first, out):
-    """Columns, from `first` on, of a part of a row of `marks` whose bits in `mask` are those `wanted`; how many."""
-    n = 0
-    for j in range(marks.shape[0]):
-        out[n] = first + j
-        n += (marks[j] & mask) == wanted
+def _listed(marks, top, end, left, right, width, mask, wanted, n, place, start, target):
+    """Append to the `n` places the pixels of a tile whose bits of `marks` (H * W,) in `mask` are those `wanted`.
+
+    Those of row `top` + r have the targets start[r] and on; `start` is moved on.
+    """
+    for i in range(top, end):
+        p, at = np.uintp(i * width + left), start[i - top]
+        for j in range(right - left):
+            has = (marks[p + np.uintp(j)] & mask) == wanted
+            place[n], target[n] = p + np.uintp(j), at
+            n += has
+            at += has
+        start[i - top] = at
     return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touch(side, row, column, n, coloured):
+def _touch(side, place, n, coloured):
     """Reads every fourth of the pixels that will be needed, whose lines then come to the caches side by side."""
     some = _ZERO
     for k in range(0, n, 4):
-        if row[k] >= 0:
-            p = np.uintp(row[k] * side.width + column[k])
-            q = p + p + p
-            some += side.xyz[q] + side.sigma[p] + _f(side.code[p + p]) + _f(side.rise[p])
-            if coloured:
-                some += side.rgb[q]
+        p = np.uintp(max(place[k], 0))
+        some += side.xyz[p + p + p] + side.sigma[p] + _f(side.code[p]) + _f(side.rise[p])
+        if coloured:
+            some += side.rgb[p + p + p if side.channels == 3 else p]
     return some
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fetch(side, row, column, n, S, P, Q, rise, clear):
-    """Sigma, code of the normal, rise and clearness at pixels (row, column); row -1 leaves sigma NaN."""
-    W = side.width
-    bright = side.clear.shape[0] > 1
+def _fetch(side, place, n, X, Y, Z, S, code, rise, clear):
+    """Points, sigma, code of the normal, rise and clearness of pixels; sigma is NaN where the place is -1."""
     for k in range(n):
-        if row[k] >= 0:
-            p = np.uintp(row[k] * W + column[k])
-            S[k] = side.sigma[p]
-            P[k], Q[k] = _f(side.code[p + p]), _f(side.code[p + p + _ADD1])
-            rise[k] = _f(side.rise[p])
-        else:
-            S[k] = np.nan
-            P[k] = Q[k] = rise[k] = _ZERO
+        p = np.uintp(max(place[k], 0))
+        q = p + p + p
+        X[k], Y[k], Z[k] = side.xyz[q], side.xyz[q + _ADD1], side.xyz[q + _ADD2]
+        S[k], code[k], rise[k] = side.sigma[p], side.code[p], _f(side.rise[p])
     for k in range(n):
+        S[k] = S[k] if place[k] >= 0 else _NAN
         clear[k] = _ONE
-    if bright:
+    if side.clear.shape[0] > 1:
         for k in range(n):
-            if row[k] >= 0:
-                clear[k] = _f(side.clear[np.uintp(row[k] * W + column[k])]) * _f(1 / 255)
+            clear[k] = _f(side.clear[np.uintp(max(place[k], 0))]) * _f(1 / 255)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def decode(P, Q, n, X, Y, Z):
+def decode(code, n, X, Y, Z):
     """Codes of normals to unit vectors."""
     for k in range(n):
-        u, v = P[k] * _f(1 / CODE), Q[k] * _f(1 / CODE)
+        u, v = _f(np.int16(code[k])) * _f(1 / CODE), _f(np.int16(code[k] >> 16)) * _f(1 / CODE)
         z = _ONE - abs(u) - abs(v)
         t = max(-z, _ZERO)
         u += -t if u >= _ZERO else t
@@ -181,101 +185,6 @@ def _add(ok, along, weight, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _taps(U, V, ok, tint, clear, share, height, width, bit, n, place, fu, fv, weight, seen):
-    """The pixel up and left of (U, V), how far beyond it they are, and the weight; what is seen gets `bit`."""
-    high_u, high_v = _f(max(width - 2, 0)), _f(max(height - 2, 0))
-    for k in range(n):
-        u, v = (U[k] if ok[k] else _ZERO), (V[k] if ok[k] else _ZERO)
-        j, i = np.int32(min(u, high_u)), np.int32(min(v, high_v))
-        fu[k], fv[k] = u - _f(j), v - _f(i)
-        place[k] = 3 * (i * width + j)
-        own = tint[k] * clear[k] * share
-        weight[k] = own if ok[k] and own > _ZERO else _ZERO
-        seen[k] |= bit if ok[k] else np.uint8(0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _between(rgb, place, right, below, fu, fv, weight, gain, n, c0, c1, c2):
-    """Colours between four pixels each, bilinear, where they have a weight."""
-    right, below = np.uintp(right), np.uintp(below)
-    g0, g1, g2 = gain[0], gain[1], gain[2]
-    for k in range(n):
-        if not weight[k] > _ZERO:
-            continue
-        a = np.uintp(place[k])
-        b, c = a + right, a + below
-        d = c + right
-        x, y = fu[k], fv[k]
-        p0, p1, p2 = rgb[a], rgb[a + _ADD1], rgb[a + _ADD2]
-        q0, q1, q2 = rgb[c], rgb[c + _ADD1], rgb[c + _ADD2]
-        p0, p1, p2 = p0 + x * (rgb[b] - p0), p1 + x * (rgb[b + _ADD1] - p1), p2 + x * (rgb[b + _ADD2] - p2)
-        q0, q1, q2 = q0 + x * (rgb[d] - q0), q1 + x * (rgb[d + _ADD1] - q1), q2 + x * (rgb[d + _ADD2] - q2)
-        c0[k], c1[k], c2[k] = (p0 + y * (q0 - p0)) * g0, (p1 + y * (q1 - p1)) * g1, (p2 + y * (q2 - p2)) * g2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _colours(side, U, V, ok, tint, clear, bit, n, place, fu, fv, c0, c1, c2, weight, seen):
-    """Colour of the other view at (U, V), bilinear, and its weight; what it sees is marked with `bit`."""
-    W, H = side.width, side.height
-    _taps(U, V, ok, tint, clear, side.share, H, W, bit, n, place, fu, fv, weight, seen)
-    right, below = 3 if W > 1 else 0, 3 * W if H > 1 else 0
-    _between(side.rgb, place, right, below, fu, fv, weight, side.gain, n, c0, c1, c2)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _light(c0, c1, c2, w, n, soft, total):
-    """What a view adds to the soft minimum of the views' light."""
-    for k in range(n):
-        light = max((c0[k] + c1[k] + c2[k]) * _f(1 / 3) + _f(1e-3), _f(1e-3))
-        square = light * light
-        soft[k] += w[k] / (square * square) if w[k] > _ZERO else _ZERO
-        total[k] += w[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _mix(c0, c1, c2, w, low, gloss, n, s0, s1, s2, sw):
-    """Add a view's colour: less of it where it is brighter than the others by more than the share `gloss`."""
-    for k in range(n):
-        excess = max((c0[k] + c1[k] + c2[k]) * _f(1 / 3) + _f(1e-3) - low[k], _ZERO) / (gloss * low[k])
-        use = w[k] / (_ONE + excess * excess) if w[k] > _ZERO else _ZERO
-        s0[k] += use * c0[k] if w[k] > _ZERO else _ZERO
-        s1[k] += use * c1[k] if w[k] > _ZERO else _ZERO
-        s2[k] += use * c2[k] if w[k] > _ZERO else _ZERO
-        sw[k] += use
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _darkest(total, n, soft):
-    for k in range(n):
-        soft[k] = math.sqrt(math.sqrt(total[k] / soft[k])) if total[k] > _ZERO else _ONE
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def _divide(own, weight, n, out):
-    for k in range(n):
-        out[k] = out[k] / weight[k] if weight[k] > _ZERO else own[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def blend(C, views, gloss, n, soft, total, r, g, b, weight):
-    """Blended colours r, g, b from C (views, 4, BLOCK): colours and weights; the first is the view's own.
-
-    A view that is brighter than a soft minimum over the views by more than the share `gloss` sees a highlight there
-    and counts less. Where no view has a weight the own colour stays. `soft`, `total`, `weight` are scratch.
-    """
-    for k in range(n):
-        soft[k] = total[k] = r[k] = g[k] = b[k] = weight[k] = _ZERO
-    for v in range(views):
-        _light(C[v, 0], C[v, 1], C[v, 2], C[v, 3], n, soft, total)
-    _darkest(total, n, soft)
-    for v in range(views):
-        _mix(C[v, 0], C[v, 1], C[v, 2], C[v, 3], soft, gloss, n, r, g, b, weight)
-    _divide(C[0, 0], weight, n, r)
-    _divide(C[0, 1], weight, n, g)
-    _divide(C[0, 2], weight, n, b)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def _settle_points(X, Y, Z, DX, DY, DZ, weight, shift, total, n, x, y, z):
     """The weighted mean along each ray."""
     for k in range(n):
@@ -303,38 +212,21 @@ def _settle_sigma(NX, NY, NZ, DX, DY, DZ, sigma_n, weight, total, variance, n, o
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _put(x, y, z, n, out):
-    """Three arrays to rows of `out` (n, 3)."""
-    flat = out.reshape(-1)
+def _put(x, y, z, target, n, out):
+    """Three arrays to the places `target` of `out`, flat."""
     for k in range(n):
-        flat[3 * k] = x[k]
-        flat[3 * k + 1] = y[k]
-        flat[3 * k + 2] = z[k]
+        p = np.uintp(target[k])
+        p += p + p
+        out[p], out[p + _ADD1], out[p + _ADD2] = x[k], y[k], z[k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _own(side, i, columns, n, row, X, Y, Z):
-    """The own points of the listed columns of row i."""
-    part = side.xyz[3 * i * side.width : 3 * (i + 1) * side.width]
+def _put_one(x, target, n, out):
     for k in range(n):
-        p = 3 * columns[k]
-        X[k], Y[k], Z[k] = part[p], part[p + 1], part[p + 2]
-        row[k] = i
+        out[np.uintp(target[k])] = x[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _own_colours(side, i, columns, n, tint, clear, c0, c1, c2, w):
-    part = side.rgb[3 * i * side.width : 3 * (i + 1) * side.width]
-    g0, g1, g2 = side.gain[0], side.gain[1], side.gain[2]
-    for k in range(n):
-        p = np.uintp(3 * columns[k])
-        c0[k], c1[k], c2[k] = part[p] * g0, part[p + _ADD1] * g1, part[p + _ADD2] * g2
-    for k in range(n):
-        own = tint[k] * clear[k] * side.share
-        w[k] = own if own > _ZERO else _ZERO
-
-
-@by_rows(lambda _sides, _count, _view, _limits, marks, *_: marks.shape[0])
+@by_rows(lambda _sides, _count, _view, _limits, marks, *_: -(-marks.shape[0] // HIGH))
 def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table, xyz, normal, sigma, rgb, seen,
          picture):  # fmt: skip
     """Fuse the pixels of view number `view` that have `bit` in `marks` (H, W): the mean along each pixel's ray.
@@ -342,15 +234,17 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
     The first `count` of `sides` are views. Each other view contributes the sample of the pixel nearest to the point,
     with its weight, if it lies on the same surface. Row i's points go to start[i] and on of `xyz`, `normal` (n, 3),
     `sigma`, `seen` (n,), and their blended colours to `rgb` (n, 3) and to `picture` (H, W, 3), if that has rows; then
-    pixels in squares of TILE that are `near` get blended colours as well, others their own. A point that nothing else
-    sees stays as it is. What other views see gets BLENDED in `marks`.
+    pixels in squares of TILE that are `near` get blended colours as well, others their own. Only in these squares are
+    there pixels with `bit`. A point that nothing else sees stays as it is. What other views see gets BLENDED in
+    `marks`. Rows first..last-1 are rows of tiles.
     """
     own = sides[view]
+    H, W = marks.shape
     f = np.float32
     X, Y, Z, S = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     NX, NY, NZ, SN = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     DX, DY, DZ, weight = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
-    U, V, D, P, Q = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
+    U, V, D = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     QX, QY, QZ, MX, MY, MZ = (
         np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f),
         np.empty(BLOCK, f),
@@ -361,87 +255,88 @@ def fuse(first, last, sides, count, view, limits, marks, bit, near, start, table
     )  # fmt: skip
     rise, clear, cosine, tint = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     sigma_w, weight_w, along = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
-    C, code, green = np.empty((count, 4, BLOCK), f), np.empty(3 * BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    place, factors = np.empty(BLOCK, np.int64), np.empty(3 * BLOCK, f)
-    C[:] = _ZERO
-    for k in range(3 * BLOCK):
+    C, mixed = np.zeros((count, 4, BLOCK), f), np.empty((7, BLOCK), f)
+    codes, factors = np.empty((3, BLOCK), np.int32), np.empty(3 * WIDE, f)
+    normals, place, other_place = np.empty(BLOCK, np.int32), np.empty(BLOCK + 1, np.int32), np.empty(BLOCK, np.int32)
+    ok, said, target = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.uint8), np.empty(BLOCK + 1, np.int64)
+    next_, nowhere = np.empty(HIGH, np.int64), np.zeros(HIGH, np.int64)
+    for k in range(3 * WIDE):
         factors[k] = own.gain[k % 3]
-    row, column, columns = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32), np.empty(BLOCK + 1, np.int32)
-    ok, said = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.uint8)
+    mono = True
+    for w in range(count):
+        gain = sides[w].gain
+        mono = mono and sides[w].channels == 1 and gain[0] == gain[1] and gain[0] == gain[2]
+    channels = 1 if mono else 3
+    red, green, blue = codes[0], codes[1 % channels], codes[2 % channels]
     pictured = picture.shape[0] > 0
-    if pictured:
-        for i in range(first, last):
-            line = own.rgb[3 * i * own.width : 3 * (i + 1) * own.width]
-            encode_row(line, factors, table, code, picture[i].reshape(-1))
+    shown, marked, scratch = picture.reshape(-1), marks.reshape(-1), codes.reshape(-1)
+    points, normals_out, colours_out = xyz.reshape(-1), normal.reshape(-1), rgb.reshape(-1)
     touched = _ZERO
-    next_ = start[first : last + 1].copy()
-    for col in range(0, own.width, BLOCK):  # downwards, so that the other views' pixels are still in the caches
-        end = min(col + BLOCK, own.width)
-        for i in range(first, last):
-            for turn in range(2 if pictured and count > 1 else 1):
-                if turn == 0:
-                    n = listed(marks[i, col:end], bit, bit, col, columns)
-                else:
-                    n = 0
-                    for left in range(col, end, TILE):
-                        if near[i // TILE, left // TILE] != 0:
-                            part = marks[i, left : min(left + TILE, end)]
-                            n += listed(part, POINT | OWNED, POINT, left, columns[n:])
-                if n == 0:
+    for t in range(first, last):
+        top, end = t * HIGH, min((t + 1) * HIGH, H)
+        for i in range(top, end):
+            next_[i - top] = start[i]
+        for left in range(0, W, WIDE):
+            right = min(left + WIDE, W)
+            n = mine = 0
+            if near[top // TILE, left // TILE] != 0:
+                n = mine = _listed(marked, top, end, left, right, W, bit, bit, 0, place, next_, target)
+                if pictured and count > 1:
+                    n = _listed(marked, top, end, left, right, W, POINT | OWNED, POINT, n, place, nowhere, target)
+            if pictured and n < (end - top) * (right - left):
+                encode_tile(own, top, end, left, right, factors, table, scratch, shown)
+            if n == 0:
+                continue
+            _fetch(own, place, n, X, Y, Z, S, normals, rise, clear)
+            decode(normals, n, NX, NY, NZ)
+            weigh(X, Y, Z, S, NX, NY, NZ, rise, own.centre, limits, n, cosine, SN, weight, tint)
+            _rays(X, Y, Z, own.centre, n, DX, DY, DZ)
+            for k in range(n):
+                shift[k] = total[k] = variance[k] = FX[k] = FY[k] = FZ[k] = _ZERO
+                said[k] = 0
+                ok[k] = True
+            if pictured:
+                tint_weights(ok, tint, clear, own.share, n, C[0, 3])
+                colours_at(own, place, mono, n, C[0])
+            slot = 1
+            for w in range(count):
+                if w == view:
                     continue
-                at = next_[i - first]
-                _own(own, i, columns, n, row, X, Y, Z)
-                _fetch(own, row, columns, n, S, P, Q, rise, clear)
-                decode(P, Q, n, NX, NY, NZ)
-                weigh(X, Y, Z, S, NX, NY, NZ, rise, own.centre, limits, n, cosine, SN, weight, tint)
-                _rays(X, Y, Z, own.centre, n, DX, DY, DZ)
+                other = sides[w]
+                project(X, Y, Z, other.pose, other.lens, n, U, V, D)
+                places(U, V, D, other.height, other.width, _ZERO, n, other_place)
+                touched += _touch(other, other_place, n, pictured)
+                _fetch(other, other_place, n, QX, QY, QZ, S, normals, rise, clear)
+                decode(normals, n, MX, MY, MZ)
+                weigh(QX, QY, QZ, S, MX, MY, MZ, rise, other.centre, limits, n, cosine, sigma_w, weight_w, tint)
+                focal = _f(1.0 / math.sqrt(other.lens[0] * other.lens[1]))
+                _compare((X, Y, Z, NX, NY, NZ, SN), (DX, DY, DZ), D, (QX, QY, QZ, MX, MY, MZ), cosine, sigma_w,
+                         weight_w, focal, limits, n, along, ok)
+                _add(ok, along, weight_w, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ)
                 if pictured:
-                    _own_colours(own, i, columns, n, tint, clear, C[0, 0], C[0, 1], C[0, 2], C[0, 3])
-                for k in range(n):
-                    shift[k] = total[k] = variance[k] = FX[k] = FY[k] = FZ[k] = _ZERO
-                    said[k] = 0
-                slot = 1
-                for w in range(count):
-                    if w == view:
-                        continue
-                    other = sides[w]
-                    project(X, Y, Z, other.pose, other.lens, n, U, V, D)
-                    nearest(U, V, D, other.height, other.width, _ZERO, n, row, column)
-                    touched += _touch(other, row, column, n, pictured)
-                    pick(row, column, other.width, other.xyz, n, QX, QY, QZ)
-                    _fetch(other, row, column, n, S, P, Q, rise, clear)
-                    decode(P, Q, n, MX, MY, MZ)
-                    weigh(QX, QY, QZ, S, MX, MY, MZ, rise, other.centre, limits, n, cosine, sigma_w, weight_w, tint)
-                    focal = _f(1.0 / math.sqrt(other.lens[0] * other.lens[1]))
-                    _compare((X, Y, Z, NX, NY, NZ, SN), (DX, DY, DZ), D, (QX, QY, QZ, MX, MY, MZ), cosine, sigma_w,
-                             weight_w, focal, limits, n, along, ok)
-                    _add(ok, along, weight_w, sigma_w, MX, MY, MZ, n, shift, total, variance, FX, FY, FZ)
-                    if pictured:
-                        _colours(other, U, V, ok, tint, clear, np.uint8(1 << w), n, place, along, cosine, C[slot, 0],
-                                 C[slot, 1], C[slot, 2], C[slot, 3], said)
-                    slot += 1
-                if pictured:
-                    blend(C, count, limits.gloss, n, cosine, tint, U, V, D, P)
-                    codes_of(U, table, n, row)
-                    codes_of(V, table, n, column)
-                    codes_of(D, table, n, green)
-                    target = picture[i].reshape(-1)
                     for k in range(n):
-                        c = columns[k]
-                        target[3 * c], target[3 * c + 1], target[3 * c + 2] = row[k], column[k], green[k]
-                        marks[i, c] |= BLENDED if said[k] != 0 else 0
-                    if turn == 0:
-                        _put(row, column, green, n, rgb[at : at + n])
-                        for k in range(n):
-                            seen[at + k] = said[k] | np.uint8(1 << view)
-                if turn == 0:
-                    _settle_points(X, Y, Z, DX, DY, DZ, weight, shift, total, n, QX, QY, QZ)
-                    _put(QX, QY, QZ, n, xyz[at : at + n])
-                    _settle_normals(NX, NY, NZ, weight, FX, FY, FZ, n, MX, MY, MZ)
-                    _put(MX, MY, MZ, n, normal[at : at + n])
-                    _settle_sigma(NX, NY, NZ, DX, DY, DZ, SN, weight, total, variance, n, sigma[at : at + n])
-                    next_[i - first] += n
-    code[0] = np.int32(touched > _ZERO)  # so that no compiler takes the reading away
+                        said[k] |= np.uint8(1 << w) if ok[k] else np.uint8(0)
+                    tint_weights(ok, tint, clear, other.share, n, C[slot, 3])
+                    taps(U, V, ok, other.height, other.width, n, other_place, along, cosine)
+                    colours_between(other, other_place, along, cosine, mono, n, C[slot])
+                slot += 1
+            _settle_points(X, Y, Z, DX, DY, DZ, weight, shift, total, mine, QX, QY, QZ)
+            _settle_normals(NX, NY, NZ, weight, FX, FY, FZ, mine, MX, MY, MZ)
+            _settle_sigma(NX, NY, NZ, DX, DY, DZ, SN, weight, total, variance, mine, S)
+            if pictured:
+                blend(C, count, limits.gloss, channels, n, mixed)
+                for c in range(channels):
+                    codes_of(mixed[c], table, n, codes[c])
+                _put(red, green, blue, place, n, shown)
+                for k in range(n):
+                    marked[np.uintp(place[k])] |= BLENDED if said[k] != 0 else 0
+                    said[k] |= np.uint8(1 << view)
+                _put(red, green, blue, target, mine, colours_out)
+                _put_one(said, target, mine, seen)
+            _put(QX, QY, QZ, target, mine, points)
+            _put(MX, MY, MZ, target, mine, normals_out)
+            _put_one(S, target, mine, sigma)
+    codes[0, 0] = np.int32(touched > _ZERO)  # so that no compiler takes the reading away
 
 
 @by_rows(lambda _side, _limits, _step, _raster, _rows, _cols, weight, *_: weight.shape[0])
@@ -450,16 +345,14 @@ def thinned(first, last, side, limits, step, raster, rows, cols, weight, row_out
     f = np.float32
     X, Y, Z, S = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     NX, NY, NZ = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
-    P, Q = np.empty(BLOCK, f), np.empty(BLOCK, f)
     rise, clear, cosine, sigma_n = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
-    tint, row, columns = np.empty(BLOCK, f), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    tint, place, code = np.empty(BLOCK, f), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     for i in range(first, last):
         for col in range(0, weight.shape[1], BLOCK):
             n = min(BLOCK, weight.shape[1] - col)
             for k in range(n):
-                columns[k] = (col + k) * step
-            _own(side, i * step, columns, n, row, X, Y, Z)
-            _fetch(side, row, columns, n, S, P, Q, rise, clear)
-            decode(P, Q, n, NX, NY, NZ)
+                place[k] = i * step * side.width + (col + k) * step
+            _fetch(side, place, n, X, Y, Z, S, code, rise, clear)
+            decode(code, n, NX, NY, NZ)
             weigh(X, Y, Z, S, NX, NY, NZ, rise, side.centre, limits, n, cosine, sigma_n, weight[i, col : col + n], tint)
             locate(X, Y, Z, raster, rows, cols, n, row_out[i, col : col + n], column_out[i, col : col + n])

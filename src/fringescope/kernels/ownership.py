@@ -169,7 +169,7 @@ def count_marked(first, last, marks, bit, out):
         out[i] = n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def number(marks, bit, stride, first, out):
     """Numbers, from `first` on, of the pixels with `bit` in `marks` (H, W), row by row; returns the next one.
 

@@ -12,10 +12,10 @@ from fringescope.jit import njit
 from fringescope.kernels.views import split
 from fringescope.threads import by_rows
 
-BLOCK = 256  #: pixels of a row that are worked on together
+BLOCK = 1024  #: pixels of a row that are worked on together
 REACH = 2  #: radius of the windows that the fast way knows
 CODE = 32767  #: a normal's code is this times its octahedral coordinates
-NOTHING = -32768  #: first code where there is no point
+NOTHING = -32768  #: lower half of the code where there is no point
 SOME, TORN = 1, 2  #: bits of a square of pixels: it has a point, a jump
 
 _f = np.float32
@@ -188,7 +188,8 @@ def _cross(ux, vx, uy, vy, uz, vz, X, Y, Z, cx, cy, cz, n, NX, NY, NZ, ask):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
 def _encode(X, NX, NY, NZ, n, out):
-    """Unit normals to octahedral coordinates (2 n,) int16, to 3e-5 rad; NOTHING where there is no point."""
+    """Unit normals to octahedral coordinates, two of 16 bits in an int32, to 3e-5 rad; NOTHING where there is no point.
+    """
     for k in range(n):
         x, y, z = NX[k], NY[k], NZ[k]
         share = _f(CODE) / (abs(x) + abs(y) + abs(z))
@@ -199,8 +200,8 @@ def _encode(X, NX, NY, NZ, n, out):
         u += _HALF if u >= _ZERO else -_HALF
         v += _HALF if v >= _ZERO else -_HALF
         none = X[k + 2] != X[k + 2]
-        out[2 * k] = np.int16(_f(NOTHING) if none else u)
-        out[2 * k + 1] = np.int16(_ZERO if none else v)
+        low, high = np.int32(_f(NOTHING) if none else u), np.int32(_ZERO if none else v)
+        out[k] = np.int32((low & 65535) | (high << 16))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -299,7 +300,7 @@ def _walk(first, last, xyz, flat, sigma, centre, angle, radius, max_slope, jump_
                     out[i, col + k, 1] = _NAN if none else NY[k]
                     out[i, col + k, 2] = _NAN if none else NZ[k]
             if len(code) > 0:
-                _encode(centre_x, NX, NY, NZ, n, code[i, 2 * col : 2 * (col + n)])
+                _encode(centre_x, NX, NY, NZ, n, code[i, col : col + n])
                 locate(X[c][2:], Y[c][2:], Z[c][2:], raster, there.shape[0], there.shape[1], n, row, column)
                 for k in range(n):
                     if row[k] >= 0:
@@ -321,7 +322,7 @@ def normals(first, last, xyz, flat, sigma, centre, angle, radius, max_slope, jum
     normal points to the camera; NaN where there is no point. `flat` (H, 3 W) are the same points; `angle` is the least
     angle between the rays of neighbouring pixels: what lies no farther apart along the ray is no jump.
     """
-    none, one = np.empty((0, 0), np.int16), np.empty((0, 0), np.uint8)
+    none, one = np.empty((0, 0), np.int32), np.empty((0, 0), np.uint8)
     _walk(first, last, xyz, flat, sigma, centre, angle, radius, max_slope, jump_sigma, out, none, one, 1,
           np.empty(0), one)  # fmt: skip
 
@@ -329,7 +330,7 @@ def normals(first, last, xyz, flat, sigma, centre, angle, radius, max_slope, jum
 @by_rows(lambda _xyz, _flat, _sigma, _centre, _angle, _radius, _slope, _jump, squares, *_: squares.shape[0])
 def survey(first, last, xyz, flat, sigma, centre, angle, radius, max_slope, jump_sigma, squares, step, raster, code,
            there):  # fmt: skip
-    """What fusion must know of every pixel: `code` (H, 2 W) int16 of its normal (see `normals`, `fusing.decode`).
+    """What fusion must know of every pixel: `code` (H, W) int32 of its normal (see `normals`, `fusing.decode`).
 
     `squares` (h, w), zeros, gets the bits of squares of `step` x `step` pixels; `there` (rows, cols) gets 1 in cells of
     the raster (see `locate`) that hold a point. Rows are rows of squares.

@@ -77,45 +77,40 @@ def project(X, Y, Z, pose, lens, n, U, V, D):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
-def nearest(U, V, D, height, width, edge, n, row, column):
-    """The pixel nearest to each (U, V) that lies in the picture, grown by `edge`, in front of the camera; else row -1.
+def places(U, V, D, height, width, edge, n, place):
+    """The number of the pixel nearest to each (U, V), row by row, if that lies in the picture, grown by `edge`, in
+    front of the camera; else -1.
     """
-    high_u, high_v = _f(width - 1), _f(height - 1)
+    high_u, high_v, wide = _f(width - 1), _f(height - 1), np.int32(width)
     for k in range(n):
         u, v = U[k], V[k]
         inside = (D[k] > _ZERO) & (u >= -edge) & (v >= -edge) & (u <= high_u + edge) & (v <= high_v + edge)
         u = min(max(u, _ZERO), high_u) if inside else _ZERO
-        v = min(max(v, _ZERO), high_v) if inside else -_ONE
-        column[k] = np.int32(u + _HALF)
-        row[k] = np.int32(v + _HALF) if inside else np.int32(-1)
+        v = min(max(v, _ZERO), high_v) if inside else _ZERO
+        at = np.int32(v + _HALF) * wide + np.int32(u + _HALF)
+        place[k] = np.int32(at) if inside else np.int32(-1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touch(row, column, width, xyz, sigma, n):
+def _touch(place, xyz, sigma, n):
     """Reads every fourth of the pixels that will be needed, whose lines then come to the caches side by side."""
     some = _ZERO
     for k in range(0, n, 4):
-        if row[k] >= 0:
-            p = np.uintp(row[k] * width + column[k])
-            some += xyz[p + p + p] + sigma[p]
+        p = np.uintp(max(place[k], 0))
+        some += xyz[p + p + p] + sigma[p]
     return some
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pick(row, column, width, xyz, n, X, Y, Z):
-    """The points at pixels (row, column), NaN where row is -1."""
+def _pick(place, xyz, sigma, n, X, Y, Z, S):
+    """The points and sigmas of pixels, NaN where there is none."""
     for k in range(n):
-        if row[k] >= 0:
-            p = np.uintp(3 * (row[k] * width + column[k]))
-            X[k], Y[k], Z[k] = xyz[p], xyz[p + _ADD1], xyz[p + _ADD2]
-        else:
-            X[k] = _NAN
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _noise(row, column, width, sigma, n, S):
+        p = np.uintp(max(place[k], 0))
+        S[k] = sigma[p]
+        p += p + p
+        X[k], Y[k], Z[k] = xyz[p], xyz[p + _ADD1], xyz[p + _ADD2]
     for k in range(n):
-        S[k] = sigma[np.uintp(row[k] * width + column[k])] if row[k] >= 0 else _ZERO
+        X[k] = X[k] if place[k] >= 0 else _NAN
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
@@ -208,7 +203,9 @@ def planes(first, last, view, centre, out):
         np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f),
         np.empty(BLOCK, f),
     )  # fmt: skip
-    F, some = np.empty((9, BLOCK), f), np.empty(TILE, np.int64)
+    F, some, side = np.empty((9, BLOCK), f), np.empty(TILE, np.int64), np.empty(TILE, f)
+    for j in range(TILE):
+        side[j] = _f(j - 3.5) * _f(1 / 3.5)
     low, high, stray, least = np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f), np.empty(BLOCK, f)
     half = _f(3.5 / 4 / 32)  # sums of two times sixteen points four pixels apart, to three and a half
     cx, cy, cz = _f(centre[0]), _f(centre[1]), _f(centre[2])
@@ -251,12 +248,12 @@ def planes(first, last, view, centre, out):
                 if nx * (cx - a[0]) + ny * (cy - a[1]) + nz * (cz - a[2]) < _ZERO:
                     scale = -scale
                 a[9], a[10], a[11] = nx * scale, ny * scale, nz * scale
-                for j in range(TILE):
-                    x = _f(j - 3.5) * _f(1 / 3.5)
-                    for c in range(3):
-                        F[c, k + j] = a[c] + x * a[3 + c]
-                        F[3 + c, k + j] = a[6 + c]
-                        F[6 + c, k + j] = a[9 + c]
+                for c in range(3):
+                    middle, across, down, up = a[c], a[3 + c], a[6 + c], a[9 + c]
+                    for j in range(TILE):
+                        F[c, k + j] = middle + side[j] * across
+                        F[3 + c, k + j] = down
+                        F[6 + c, k + j] = up
             for k in range(n):
                 low[k] = least[k] = np.inf
                 high[k] = stray[k] = -np.inf
@@ -359,22 +356,23 @@ def doubtful(first, last, view, own, other, plane, tolerance, slack, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gather(own, i, columns, n, X, Y, Z, sigma):
-    """Points and sigmas of the listed columns of row i."""
-    part, noise = own.xyz[3 * i * own.width : 3 * (i + 1) * own.width], own.sigma[i * own.width : (i + 1) * own.width]
-    for k in range(n):
-        p = 3 * columns[k]
-        X[k], Y[k], Z[k], sigma[k] = part[p], part[p + 1], part[p + 2], noise[columns[k]]
+def _append(top, end, left, right, width, n, place):
+    """Append the pixels of a tile to the `n` places."""
+    for i in range(top, end):
+        for j in range(left, right):
+            place[n] = i * width + j
+            n += 1
+    return n
 
 
-@by_rows(lambda own, *_: own.height)
+@by_rows(lambda _own, _others, _count, _tolerance, _slack, asked, *_: asked.shape[1])
 def contradicted(first, last, own, others, count, tolerance, slack, asked, bad, lost):
     """Points that one of the first `count` of the `others` looks through, and that none confirms: 1 in `bad` (H, W).
 
     The other surface is interpolated between four pixels that all carry points. Nearer than `tolerance` combined sigmas
     plus `slack` pixel footprints plus the rise among the four: confirmed. In front of it by more: denied. Behind it:
     hidden there, no evidence. Depths are along the other camera's axis. `bad` comes as zeros; `lost` (H,) counts. Only
-    the tiles `asked` (V, h, w) are compared with each of the others.
+    the tiles `asked` (V, h, w) are compared with each of the others. Rows first..last-1 are rows of tiles.
 
     What is denied lies in front of each of the four by more than both their sigmas and the footprints: only points that
     lie so far in front of the nearest pixel's are examined.
@@ -383,34 +381,33 @@ def contradicted(first, last, own, others, count, tolerance, slack, asked, bad, 
     X, Y, Z = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     U, V, D = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     A, B, C = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    sigma, S, columns = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
-    row, column, ask = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.bool_)
-    lost[first:last] = 0
+    sigma, S, ask = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.bool_)
+    here, there = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    marked = bad.reshape(-1)
     touched = _ZERO
-    for o in range(count):
-        other = others[o]
-        footprint = _f(slack / other.lens[0]) - ROUNDING
-        for i in range(first, last):
-            u, tiles = 0, asked[o, i // TILE]
-            while u < len(tiles):
+    for t in range(first, last):
+        top, end = t * TILE, min(t * TILE + TILE, own.height)
+        lost[top:end] = 0
+        for o in range(count):
+            other = others[o]
+            footprint = _f(slack / other.lens[0]) - ROUNDING
+            u = 0
+            while u < asked.shape[2]:
                 n = 0
-                while u < len(tiles) and n + TILE <= BLOCK:
-                    if tiles[u]:
-                        for j in range(TILE * u, min(TILE * u + TILE, W)):
-                            columns[n] = j
-                            n += 1
+                while u < asked.shape[2] and n + TILE * TILE <= BLOCK:
+                    if asked[o, t, u]:
+                        n = _append(top, end, TILE * u, min(TILE * u + TILE, W), W, n, here)
                     u += 1
                 if n == 0:
                     continue
-                _gather(own, i, columns, n, X, Y, Z, sigma)
+                _pick(here, own.xyz, own.sigma, n, X, Y, Z, sigma)
                 project(X, Y, Z, other.pose, other.lens, n, U, V, D)
-                nearest(U, V, D, other.height, other.width, EDGE, n, row, column)
-                touched += _touch(row, column, other.width, other.xyz, other.sigma, n)
-                pick(row, column, other.width, other.xyz, n, A, B, C)
-                _noise(row, column, other.width, other.sigma, n, S)
+                places(U, V, D, other.height, other.width, EDGE, n, there)
+                touched += _touch(there, other.xyz, other.sigma, n)
+                _pick(there, other.xyz, other.sigma, n, A, B, C, S)
                 _suspects(D, A, B, C, sigma, S, other.pose, _f(tolerance), footprint, n, ask)
                 for k in range(n):
-                    if not ask[k] or bad[i, columns[k]] != 0:
+                    if not ask[k] or marked[here[k]] != 0:
                         continue
                     denied = confirmed = 0
                     for q in range(count):
@@ -419,8 +416,8 @@ def contradicted(first, last, own, others, count, tolerance, slack, asked, bad, 
                         denied += said < 0
                         confirmed += said > 0
                     if denied > 0 and confirmed == 0:
-                        bad[i, columns[k]] = 1
-                        lost[i] += 1
+                        marked[here[k]] = 1
+                        lost[here[k] // W] += 1
     X[0] = touched  # so that no compiler takes the reading away
 
 
