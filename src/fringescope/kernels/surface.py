@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from fringescope.jit import njit
+from fringescope.kernels.raw import unowned
 from fringescope.kernels.views import split
 from fringescope.threads import by_rows
 
@@ -241,6 +242,8 @@ def locate(X, Y, Z, raster, rows, cols, n, row, column):
 def _walk(first, last, xyz, flat, sigma, centre, angle, radius, max_slope, jump_sigma, out, code, squares, step, raster,
           there):  # fmt: skip
     """Rows first..last-1 of `normals` (where `out` has rows) and of `survey` (where `code` has)."""
+    xyz, flat, sigma, out = unowned(xyz), unowned(flat), unowned(sigma), unowned(out)
+    code, squares, raster, there = unowned(code), unowned(squares), unowned(raster), unowned(there)
     W = sigma.shape[1]
     m = BLOCK + 4
     f = np.float32

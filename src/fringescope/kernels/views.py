@@ -11,6 +11,7 @@ import numpy as np
 
 from fringescope.jit import njit
 from fringescope.kernels.lens import to_plane
+from fringescope.kernels.raw import unowned
 from fringescope.threads import by_rows
 
 BLOCK = 512  #: pixels of a row that are worked on together
@@ -181,6 +182,7 @@ def _stray(X, Y, Z, sigma, y, F, n, low, high, stray, least):
         s = nx[k] * dx + ny[k] * dy + nz[k] * dz
         away = dx * dx + dy * dy + dz * dz
         a, b, c, d = low[k], high[k], stray[k], least[k]
+        a, b, c, d = a + _ZERO, b + _ZERO, c + _ZERO, d + _ZERO  # else masked stores, which are slow: see tiles.py
         low[k] = s if s < a else a
         high[k] = s if s > b else b
         stray[k] = away if away > c else c
@@ -197,6 +199,7 @@ def planes(first, last, view, centre, out):
     middle is too if there is none at all.
     """
     W = view.width
+    xyz, sigma, out = unowned(view.xyz), unowned(view.sigma), unowned(out)
     f = np.float32
     X, Y, Z = np.empty((TILE, BLOCK), f), np.empty((TILE, BLOCK), f), np.empty((TILE, BLOCK), f)
     xu, xl, yu, yl, zu, zl = (
@@ -216,7 +219,7 @@ def planes(first, last, view, centre, out):
             found = 0
             for r in range(rows):
                 i = t * TILE + r
-                some[r] = split(view.xyz[3 * i * W : 3 * (i + 1) * W], col, n, X[r], Y[r], Z[r])
+                some[r] = split(xyz[3 * i * W : 3 * (i + 1) * W], col, n, X[r], Y[r], Z[r])
                 found += some[r]
             tiles = out[t, col // TILE : (col + n + TILE - 1) // TILE]
             if found < rows * n or rows < TILE or n % TILE:
@@ -260,7 +263,7 @@ def planes(first, last, view, centre, out):
             for r in range(TILE):
                 p = (t * TILE + r) * W + col
                 y = _f(r - 3.5) * _f(1 / 3.5)
-                _stray(X[r], Y[r], Z[r], view.sigma[p : p + n], y, F, n, low, high, stray, least)
+                _stray(X[r], Y[r], Z[r], sigma[p : p + n], y, F, n, low, high, stray, least)
             for q in range(len(tiles)):
                 k = TILE * q
                 a = tiles[q]
