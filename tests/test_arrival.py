@@ -45,9 +45,10 @@ def same(view, rig, s=S, sets=None):
 
 
 @pytest.mark.parametrize("fmt", list(PixelFormat)[:-1])
-def test_every_pixel_format(fmt):
+@pytest.mark.parametrize("steps", [(4, 4, 8), (3, 5, 12)])
+def test_every_pixel_format(fmt, steps):
     rig = rig_of(1190, 41)  # more than two blocks of pixels
-    same(known(view_of(rig, rig.cameras[1], fmt)), rig, sets=2)
+    same(known(view_of(rig, rig.cameras[1], fmt, steps=steps)), rig, sets=2)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +124,34 @@ def test_coarse_sets_are_worked_out_while_the_finest_is_on_its_way():
         beginning.add(key, frame)
         done.append(beginning.begun.sets if beginning.begun else 0)
     assert done == [0] * 3 + [1] * 4 + [2] * 9
+
+
+def test_one_buffer_for_all_frames_is_refused():
+    rig = rig_of()
+    view = view_of(rig, rig.cameras[1], PixelFormat.MONO8)
+    ring = np.empty_like(view.frames[0][1])
+
+    def frames():
+        for key, frame in view.frames:
+            ring[:] = frame
+            yield key, ring
+
+    with pytest.raises(CaptureError, match=r"lies in the memory of .* copy each one"):
+        pipeline.scan_view(replace(view, frames=frames()), rig, S)
+
+
+def test_a_camera_that_runs_on_is_refused():
+    rig, views = three()
+    asked = []
+
+    def endless():
+        for n in range(10_000):
+            asked.append(n)
+            yield views[0].frames[n % 16][0], views[0].frames[n % 16][1].copy()
+
+    with pytest.raises(CaptureError, match="more than the plan's 16 frames came"):
+        pipeline.scan([replace(views[0], frames=endless()), *views[1:]], rig)
+    assert len(asked) <= 18
 
 
 def test_frames_that_are_not_the_plans_are_refused_as_ever():
@@ -222,6 +251,19 @@ def test_what_the_source_raises_is_raised_and_the_others_are_not_begun():
         pipeline.scan([replace(v, frames=f) for v, f in zip(views, frames, strict=True)], rig)
     assert not begun
     assert not [t for t in threading.enumerate() if t.name == "frames"]
+
+
+@pytest.mark.parametrize("error", [SystemExit, KeyboardInterrupt, GeneratorExit])
+def test_whatever_the_source_raises_ends_the_scan(error):
+    rig, views = three()
+
+    class Source:
+        def __iter__(self):
+            yield from views[0].frames[:3]
+            raise error
+
+    with pytest.raises(error):
+        pipeline.scan([replace(views[0], frames=Source())], rig)
 
 
 def test_a_scan_that_fails_closes_the_source_that_is_being_read():

@@ -129,4 +129,10 @@ def test_a_kernel_out_of_the_cache_is_the_kernel(tmp_path: Path) -> None:
     assert compiled == []
     numbas = imported_by(code, "numbas", **cache)
     assert numbas == [new, [], ["JITCodeLibrary", "JITCodeLibrary"], True]  # what is not as expected is left to Numba
+    for damage in (b"", b"no kernel at all", b"\x80\x04K\x01."):
+        for kind in ("nbi", "nbc"):
+            for file in Path(cache["NUMBA_CACHE_DIR"]).rglob(f"*.{kind}"):
+                file.write_bytes(damage)
+            assert imported_by(code, **cache)[0] == new  # compiled again
+    assert imported_by(code, **cache) == again
     assert imported_by(code, "old", **cache) == numbas  # and so is all of a version that was not tried

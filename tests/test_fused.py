@@ -128,6 +128,36 @@ def test_saturated_samples_take_the_scalar_way():
         assert abs(int(((got & bit) != 0).sum()) - int(((want & bit) != 0).sum())) < 0.002 * got.size
 
 
+@pytest.mark.parametrize("flip", [(0,), (1,), (2,), (0, 1), (0, 1, 2)])
+def test_saturated_samples_of_sets_that_point_the_other_way(flip):
+    rig = rig_of()
+    compare(view_of(rig, rig.cameras[1], PixelFormat.MONO8, flip=flip, A=0.8, B=0.4), rig, apart=0.002)
+
+
+def test_a_wrong_frame_shows_beside_saturated_samples():
+    rig = rig_of()
+    view = view_of(rig, rig.cameras[1], PixelFormat.MONO8, A=0.8, B=0.4)
+    frames = [(k, f.copy()) for k, f in view.frames]
+    wrong = frames[10][1]
+    wrong[:, 60:120] = np.maximum(wrong[:, 60:120].astype(int) - 60, 0)
+    view = replace(view, frames=frames)
+    got, (_, want) = fast.decode(view, rig, S).decoded, by_stages(view, rig)
+    torn, expected = ((r & Reason.INCONSISTENT) != 0 for r in (got.reasons, want.reasons))
+    clipped = np.any([f == 255 for _, f in frames], axis=0)
+    assert (expected & clipped).sum() > 500
+    assert (torn != expected).mean() < 0.003
+    assert ((got.reasons == 0) != (want.reasons == 0)).mean() < 0.003
+
+
+def test_sets_of_different_exposure_go_the_stages_way():
+    rig = rig_of()
+    view = view_of(rig, rig.cameras[1], PixelFormat.MONO8)
+    sets = tuple(replace(one, exposure_us=e) for one, e in zip(view.plan.sets, (4000, 4000, 1000), strict=True))
+    assert fast.decode(replace(view, plan=replace(view.plan, sets=sets)), rig, S) is None
+    same = tuple(replace(one, exposure_us=4000) for one in view.plan.sets)
+    assert fast.decode(replace(view, plan=replace(view.plan, sets=same)), rig, S) is not None
+
+
 def test_frames_of_any_memory_layout():
     rig = rig_of()
     view = view_of(rig, rig.cameras[1], PixelFormat.MONO8)

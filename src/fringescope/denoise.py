@@ -109,7 +109,10 @@ def weak(decoded: Decoded, pixel_format: PixelFormat, s: DenoiseSettings) -> tup
     return np.asarray(s.min_background * scale > A), np.asarray(low)
 
 
-def odd_stride(pixels: int, enough: int = 10_000) -> int:
+FEW = 10_000  #: pixels that are enough for a median
+
+
+def odd_stride(pixels: int, enough: int = FEW) -> int:
     """Every how many-th row and column is enough for a median: odd, so that every colour of a mosaic comes in."""
     return 2 * round((math.sqrt(pixels / enough) - 1) / 2) + 1
 

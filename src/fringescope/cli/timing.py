@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from fringescope.cli.app import app
 from fringescope.cli.common import Json, Progress, emit
-from fringescope.errors import OutputError
+from fringescope.errors import OutputError, UsageError
 
 
 @app.command()
@@ -31,6 +32,8 @@ def bench(
 
     if plot is not None and (plot.is_dir() or not plot.parent.is_dir()):
         raise OutputError(f"--plot {plot}: needed a file in a folder that exists; make the folder first")
+    if peer_python is not None and not os.access(peer_python, os.X_OK):
+        raise UsageError(f"--peer-python {peer_python}: needed a Python interpreter that can be run")
     with Progress() as progress:
         result = benchmark.measure(
             megapixels, repeat, growth=growth or plot is not None, whole=whole, peer_python=peer_python,

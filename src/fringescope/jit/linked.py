@@ -5,6 +5,7 @@ The files are Numba's own, and whatever in them is not as expected is left to Nu
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import io
@@ -49,12 +50,24 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return getattr(self, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled kernel for the types of its arguments, or None."""
+        """The compiled kernel for the types of its arguments, or None. Files that cannot be read are thrown away."""
         try:
             found = self._linked(sig, target_context)
-        except (AttributeError, KeyError, OSError, TypeError, ValueError):  # a Numba that is made otherwise
+        except Exception:  # files that are damaged, or made otherwise
             found = None
-        return super().load_overload(sig, target_context) if found is None else found
+        if found is not None:
+            return found
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:
+            with contextlib.suppress(OSError):
+                Path(self._cache_file._index_path).unlink(missing_ok=True)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a kernel; where the disk is full it is compiled again the next time."""
+        with contextlib.suppress(OSError):
+            super().save_overload(sig, data)
 
     def _linked(self, sig: Any, target_context: Any) -> Any:
         name = self._cache_file._load_index().get(self._index_key(sig, target_context.codegen()))

@@ -112,12 +112,12 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
     `phase` .. `modulation` (K, 1, 1) and `used` (K, 2) are scratch. A coarse set of two samples borrows the background
     of the set with most samples left, if that has more than three (see `phase.sums.rescue`).
     """
-    K = len(sets.frequency)
+    K, torn = len(sets.frequency), False
     for k in range(K):
         first, last = sets.start[k], sets.start[k + 1]
         steps = last - first
         clipped = np.uint64(0)
-        t = p = q = 0.0
+        t = p = q = squares = 0.0
         for f in range(first, last):
             if x[f, j] >= sets.top:
                 clipped |= np.uint64(1) << np.uint64(f - first)
@@ -126,11 +126,15 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
                 t += value
                 p += value * math.cos(2.0 * math.pi * (f - first) / steps)
                 q += value * math.sin(2.0 * math.pi * (f - first) / steps)
-        _, a, c, s, left = clipped_sinusoid(clipped, steps, t, p, q)
+                squares += value * value
+        there, a, c, s, left = clipped_sinusoid(clipped, steps, t, p, q)
         used[k, 0], used[k, 1] = clipped, np.uint64(left)
         background[k, 0, 0] = a if a < np.inf else float(sets.top)
         modulation[k, 0, 0] = math.hypot(c, s)
         phase[k, 0, 0] = math.atan2(s, c)
+        if there and left > 3.0:
+            rest = (squares - a * t - c * p - s * q) / (left - 3.0)
+            torn |= rest > limits.misfit * max(limits.noise_a + limits.noise_b * a, ROUNDING)
     donor = 0
     for k in range(K):
         donor = k if used[k, 1] > used[donor, 1] else donor
@@ -164,6 +168,8 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
         elif lost == 0 and steps == 3:
             v -= 0.5 * limits.noise_b * b * math.cos(3.0 * phase[k, 0, 0])
         sigma[k, 0, 0] = math.sqrt(gain * max(v, ROUNDING)) / b if gain < np.inf else np.inf
+        if not sets.plain[k]:
+            phase[k, 0, 0] = -phase[k, 0, 0]
     own = sigma[K - 1, 0, 0]
     for k in range(K):
         sigma[k, 0, 0] = math.hypot(sigma[k, 0, 0], 2.0 * math.pi * limits.systematic)
@@ -186,6 +192,8 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
             reasons |= limits.outside
         elif not margin * margin >= limits.margin:
             reasons |= limits.uncertain
+    if torn:
+        reasons |= limits.inconsistent
     return reasons, best / turn, own / turn, a, b
 
 

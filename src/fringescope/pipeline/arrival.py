@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterator, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from types import TracebackType
 from typing import Self, TypeVar
 
 from fringescope import memory
-from fringescope.errors import ResourceError
+from fringescope.errors import CaptureError, ResourceError
 from fringescope.pipeline import fast
 from fringescope.settings import Settings
 from fringescope.threads import WORKERS
@@ -20,6 +21,8 @@ from fringescope.types import AnyArray, FrameKey, Rig, ViewInput
 
 T = TypeVar("T")
 AHEAD = 2  #: views whose frames are held at most: that which is worked on, and the next
+
+PATIENCE_S = 6.0  #: for a source to end: a camera waits `capture.timeout_s` for a frame
 
 Arrived = tuple[FrameKey, AnyArray]
 
@@ -31,13 +34,19 @@ def is_here(view: ViewInput) -> bool:
 
 def gathered(view: ViewInput, rig: Rig, s: Settings) -> tuple[ViewInput, fast.Begun | None]:
     """A view with its frames in memory, and what was worked out while they came; one that goes the stages' way as it
-    is, since they take frames one by one.
+    is, since they take frames one by one. Raises CaptureError for more frames than the plan has, or one in another's
+    memory, and what the frames raise.
     """
     if is_here(view) or not fast.takes(view):
         return view, None
-    beginning = fast.Beginning(view, rig, s)
+    beginning, most = fast.Beginning(view, rig, s), len(view.plan.keys)
     for key, frame in view.frames:
         beginning.add(key, frame)
+        if len(beginning.frames) > most:
+            raise CaptureError(
+                f"view '{view.plan.camera}': more than the plan's {most} frames came; needed each once: one came "
+                "twice, or the camera runs on"
+            )
     return replace(view, frames=beginning.frames), beginning.begun
 
 
@@ -73,7 +82,7 @@ class Reader:
 
     def __init__(self, views: Sequence[ViewInput]) -> None:
         self._views = views
-        self._queues: list[queue.SimpleQueue[Arrived | Exception | None]] = [queue.SimpleQueue() for _ in views]
+        self._queues: list[queue.SimpleQueue[Arrived | BaseException | None]] = [queue.SimpleQueue() for _ in views]
         self._room = threading.Semaphore(AHEAD)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -90,7 +99,7 @@ class Reader:
 
     def _frames(self, n: int) -> Iterator[Arrived]:
         while (one := self._queues[n].get()) is not None:
-            if isinstance(one, Exception):
+            if isinstance(one, BaseException):
                 raise one
             yield one
 
@@ -100,18 +109,18 @@ class Reader:
                 continue
             self._room.acquire()
             try:
-                self._pass_on(view.frames, self._queues[n].put)
-            except Exception as e:  # raised again where the frames are taken
+                self._pass_on(view, self._queues[n].put)
+            except BaseException as e:  # raised again where the frames are taken
                 self._queues[n].put(e)
                 return
             if self._stop.is_set():
                 return
             self._queues[n].put(None)
 
-    def _pass_on(self, frames: Iterable[Arrived], put: Callable[[Arrived], None]) -> None:
-        source = iter(frames)
+    def _pass_on(self, view: ViewInput, put: Callable[[Arrived], None]) -> None:
+        source = iter(view.frames)
         try:
-            for one in source:
+            for one in islice(source, len(view.plan.keys) + 1):  # one too many tells that there are too many
                 if self._stop.is_set():
                     return
                 put(one)
@@ -128,7 +137,7 @@ class Reader:
         for _ in self._views:
             self._room.release()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(PATIENCE_S)  # a source that waits for a frame without end is left to itself
 
 
 VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud

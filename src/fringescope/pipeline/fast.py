@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from fringescope import denoise, geometry, memory, phase
-from fringescope.errors import RigError
+from fringescope.errors import CaptureError, RigError
 from fringescope.kernels import fused as k
 from fringescope.kernels.depths import Depths
 from fringescope.settings import Settings
@@ -152,12 +152,21 @@ class Beginning:
         self._view, self._rig, self._s = view, rig, s
         self._family = _parallel(view.plan) or []
         self._done = 0
+        self._at: dict[int, FrameKey] = {}  # where frames lie
         self._way: Way | None = None
         self._levels = np.zeros(0, np.float32)
         self._out: tuple[AnyArray, ...] = ()
 
     def add(self, key: FrameKey, frame: AnyArray) -> None:
-        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it."""
+        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it.
+
+        Raises CaptureError for a frame in the memory of another.
+        """
+        if frame.size and (before := self._at.setdefault(frame.ctypes.data, key)) != key:
+            raise CaptureError(
+                f"view '{self._view.plan.camera}': {key} lies in the memory of {before}, which it has overwritten; "
+                "needed frames that stay as they are: copy each one as it comes"
+            )
         self.frames.append((key, frame))
         while self._done < len(self._family) - 1 and len(self.frames) < len(self._view.plan.keys):
             got = _in_order(replace(self._view, frames=self.frames), self._family, self._done + 1)
@@ -215,16 +224,21 @@ def _first_way(
     table = _table(rig, camera, g, s.denoise.volume_margin)
     if table is None:
         return None
-    every = denoise.odd_stride(H * W, FIRST_SAMPLES)
-    thin = [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
-    few = phase.measure(thin, replace(plan, sets=(plan.sets[family[0][0]],)), s.phase, view.noise)
+    alone = replace(plan, sets=(plan.sets[family[0][0]],))
+
+    def measured(samples: int) -> Decoded:
+        every = denoise.odd_stride(H * W, samples)
+        thin = [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
+        return phase.measure(thin, alone, s.phase, view.noise)
+
+    few = measured(FIRST_SAMPLES)
     steps = [_fringes(plan, n).steps for n, _ in family]
     limits = _limits(few.noise, plan.pixel_format, steps, math.inf, 0.0, s.phase.systematic_rad, s)
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
+    sets = _sets(family, steps, plan.pixel_format, measured(denoise.FEW).background)
     levels = np.quantile(few.background, (0.1, 0.5, 0.9)).astype(np.float32)
     way = Way(
-        frames, g, few.noise, (), table, _sets(family, steps, plan.pixel_format, few.background), limits,
-        _depths(table, rig, camera, s), bounds, np.ones((2, 2)),
+        frames, g, few.noise, (), table, sets, limits, _depths(table, rig, camera, s), bounds, np.ones((2, 2)),
     )  # fmt: skip
     return way, levels
 
@@ -290,6 +304,7 @@ def _parallel(plan: ViewPlan) -> Family | None:
             return None
     lengths = [float(np.hypot(*h)) for _, h in out]
     alike = any(b < 1.0001 * a for a, b in pairwise(lengths))
+    alike |= len({_fringes(plan, n).exposure_us for n, _ in out}) > 1  # no set may borrow of another
     return None if alike or max(_fringes(plan, n).steps for n, _ in out) > 64 else out
 
 

@@ -161,8 +161,9 @@ class ViewInput:
     """What the pipeline takes of one view: its plan, its frames one by one in any order, its ring-light picture.
 
     A frame is (H, W) uint8 or uint16 (RGB8: (H, W, 3)), raw as the sensor gave it. Samples of 12 bits may come packed
-    as cameras send them (GenICam 12p), two in three octets: (H, W / 2, 3) uint8. `color` is raw in the same format, or
-    None. `response`: what its phases are to be freed from, or None.
+    as cameras send them (GenICam 12p), two in three octets: (H, W / 2, 3) uint8. Frames stay as they are until the work
+    on the view is done: what a driver's ring of buffers overwrites has to be copied as it comes. `color` is raw in the
+    same format, or None. `response`: what its phases are to be freed from, or None.
     """
 
     plan: ViewPlan
