@@ -90,6 +90,9 @@ def refuse(x):
         raise ValueError("negative")
     return np.sort(np.full(3, x))
 
+if "full" in sys.argv:
+    def no_room(*_): raise OSError(28, "No space left on device")
+    inside.FunctionCache.save_overload = no_room
 compiled = []
 class Listener(event.Listener):
     def on_start(self, e): compiled.append(e.data["dispatcher"].py_func.__name__)
@@ -122,6 +125,8 @@ def test_a_kernel_out_of_the_cache_is_the_kernel(tmp_path: Path) -> None:
     assert "refuse" in compiled
     assert ready
     assert new == [9.0, [2.0, 2.0, 2.0], "negative"]
+    full = imported_by(code, "full", NUMBA_CACHE_DIR=str(tmp_path / "full"))
+    assert full[0] == new  # a disk without room: compiled, not kept
     again = imported_by(code, **cache)
     assert again == [new, [], ["_Library", "_Library"], False]  # linked, and Numba was not made ready to compile
     called, compiled, *_ = imported_by(code, "calls", **cache)

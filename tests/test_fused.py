@@ -89,11 +89,11 @@ def test_every_pixel_format(fmt):
     compare(view_of(rig, rig.cameras[1], fmt), rig, apart=0.001)
 
 
-@pytest.mark.parametrize(
-    ("periods", "steps"),
-    [((270.0, 60.0, 16.0), (3, 3, 3)), ((270.0, 60.0, 16.0), (5, 4, 7)), ((270.0, 40.0), (4, 12)),
-     ((40.0, 37.0), (6, 6)), ((270.0, 90.0, 40.0, 16.0), (4, 3, 5, 16)), ((250.0,), (8,))],
-)  # fmt: skip
+PLANS = [((270.0, 60.0, 16.0), (3, 3, 3)), ((270.0, 60.0, 16.0), (5, 4, 7)), ((270.0, 40.0), (4, 12)),
+         ((40.0, 37.0), (6, 6)), ((270.0, 90.0, 40.0, 16.0), (4, 3, 5, 16)), ((250.0,), (8,))]  # fmt: skip
+
+
+@pytest.mark.parametrize(("periods", "steps"), PLANS)
 def test_every_plan(periods, steps):
     rig = rig_of()
     compare(view_of(rig, rig.cameras[2], PixelFormat.MONO12, periods, steps), rig, apart=0.002)

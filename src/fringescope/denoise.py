@@ -7,7 +7,6 @@ move one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -113,8 +112,8 @@ FEW = 10_000  #: pixels that are enough for a median
 
 
 def odd_stride(pixels: int, enough: int = FEW) -> int:
-    """Every how many-th row and column is enough for a median: odd, so that every colour of a mosaic comes in."""
-    return 2 * round((math.sqrt(pixels / enough) - 1) / 2) + 1
+    """Every how many-th row and column is enough for a median; see `statistics.odd_stride`."""
+    return statistics.odd_stride(pixels, enough)
 
 
 def usual_exposure(

@@ -3,9 +3,18 @@
 Arrays and scalars only.
 """
 
+import math
+
 import numpy as np
 
 from fringescope.jit import njit
+
+
+def odd_stride(pixels: int, enough: int) -> int:
+    """Every how many-th row and column of a picture leaves about `enough` of its pixels: odd, so that every colour of a
+    mosaic comes in.
+    """
+    return 2 * round((math.sqrt(pixels / enough) - 1) / 2) + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -35,8 +35,7 @@ def estimate_noise(measured: Sequence[Measured], max_value: int) -> NoiseModel:
     frame, motion) and do not count. With three steps only, the backgrounds of two sets of one exposure differ by noise
     and serve instead. Falls back to 0.6 codes of read noise and b = 0.03 of the 8-bit scale.
     """
-    pixels = measured[0].phase.size if measured else SAMPLES
-    thin = 2 * round((math.sqrt(pixels / SAMPLES) - 1) / 2) + 1  # odd: every colour of a mosaic
+    thin = k.odd_stride(measured[0].phase.size if measured else SAMPLES, SAMPLES)
     cut = (slice(None, None, thin), slice(None, None, thin))
     sets: list[_Bins] = []
     for m in measured:

@@ -17,7 +17,7 @@ from fringescope.errors import CaptureError, ResourceError
 from fringescope.pipeline import fast
 from fringescope.settings import Settings
 from fringescope.threads import WORKERS
-from fringescope.types import AnyArray, FrameKey, Rig, ViewInput
+from fringescope.types import AnyArray, FrameKey, PixelFormat, Rig, ViewInput
 
 T = TypeVar("T")
 AHEAD = 2  #: views whose frames are held at most: that which is worked on, and the next
@@ -140,6 +140,12 @@ class Reader:
             self._thread.join(PATIENCE_S)  # a source that waits for a frame without end is left to itself
 
 
+def _bytes_of(view: ViewInput) -> int:
+    """Bytes of all frames, a pixel."""
+    fmt = view.plan.pixel_format
+    return len(view.plan.keys) * fmt.dtype.itemsize * (3 if fmt is PixelFormat.RGB8 else 1)
+
+
 VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud
 
 
@@ -150,8 +156,7 @@ def check_memory(views: Sequence[ViewInput], rig: Rig) -> None:
         return
     lenses = [rig.camera(v.plan.camera).lens for v in views]
     pixels = [lens.width * lens.height for lens in lenses]
-    unread = [0 if is_here(v) else len(v.plan.keys) * v.plan.pixel_format.dtype.itemsize for v in views]
-    frames = [n * u for n, u in zip(pixels, unread, strict=True)]
+    frames = [0 if is_here(v) else n * _bytes_of(v) for n, v in zip(pixels, views, strict=True)]
     need = max(n * VIEW_BYTES for n in pixels) + sum(sorted(frames)[-AHEAD:]) + sum(pixels) * (KEPT_BYTES + CLOUD_BYTES)
     if need > free:
         raise ResourceError(
