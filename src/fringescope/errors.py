@@ -29,6 +29,10 @@ class CalibrationError(FringescopeError):
     """Board pictures that do not make a rig: no board, too few or too similar poses, another board than described."""
 
 
+class GuidanceError(FringescopeError):
+    """A guideline that cannot be shown as it was asked for: what is wrong with it."""
+
+
 class EmptyResultError(FringescopeError):
     """Nothing was left to return, for a reason that the message states."""
 

@@ -249,6 +249,25 @@ class CaptureSettings(_Section):
 
 
 @dataclass(frozen=True)
+class GuideSettings(_Section):
+    """Strokes to the tissue and to the projector (III-F)."""
+
+    sample_mm: float = knob(0.1, "mm", "strokes are sampled this closely on the tissue", "III-F", 0.01, 5)
+    max_samples: int = knob(20_000, "", "places at which a stroke is sampled at most; longer ones are sampled more coarsely", "", 100, 1_000_000)
+    window_mm: float = knob(0.15, "mm", "half side of the window of points that say where a stroke's place in a photograph lies", "III-F", 0)
+    jump_mm: float = knob(0.5, "mm", "a surface that moves on by more than this from one sample to the next, and 8 times the sampling, jumps: nothing is drawn between", "", 0.01)
+    max_slope: float = knob(4.0, "", "points whose range differs by more than this share of their sideways distance lie across a jump", "", 0)
+    off_surface_mm: float = knob(0.5, "mm", "a place in mm that floats farther than this above the surface is not on it", "", 0.01)
+    gap_mm: float = knob(0.75, "mm", "a place in mm where nothing was measured is taken as it was asked for if the surface around is no farther than this", "", 0)
+    shadow_mm: float = knob(0.06, "mm", "a place that lies farther than this behind what the projector lights is in its shadow; what the surface rises within a mirror comes on top", "", 0.001)
+    grazing_deg: float = knob(86.0, "deg", "light that meets the tissue at more than this from its normal only grazes it", "", 10, 90)
+    normal_mm: float = knob(0.3, "mm", "half side of the window over which the surface tells its slope, for the width of lines", "", 0.01)
+    brightness: float = knob(1.0, "", "greatest level of the projector's lamps that guidance may use", "", 0.01, 1)
+    dash_mm: float = knob(2.0, "mm", "length of the dashes, and of the gaps, of guidance that is in doubt", "", 0.1)
+    mirror_error: float = knob(0.1, "mirrors", "standard error with which a drawn line lies on the lattice of the device", "", 0)
+
+
+@dataclass(frozen=True)
 class Settings(_Section):
     """The whole tree, as stored in every scan."""
 
@@ -263,6 +282,7 @@ class Settings(_Section):
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     response: ResponseSettings = field(default_factory=ResponseSettings)
     verify: VerifySettings = field(default_factory=VerifySettings)
+    guide: GuideSettings = field(default_factory=GuideSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:

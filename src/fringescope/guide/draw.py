@@ -1,0 +1,81 @@
+"""Traces and patches to the picture that the projector shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fringescope.guide.fills import Patch
+from fringescope.guide.trace import runs, visible_runs
+from fringescope.kernels import guiding as k
+from fringescope.settings import GuideSettings
+from fringescope.types import F32, F64, U8, Guided, Layout, Projector, Trace
+
+
+def linear(color: tuple[int, int, int]) -> F64:
+    """An sRGB colour, 0..255, as levels (3,) of lamps that are linear in light, 0..1 (IEC 61966-2-1)."""
+    c = np.array(color) / 255.0
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+
+
+class Canvas:
+    """The picture of a projector, painted stroke over stroke, in levels of its lamps."""
+
+    def __init__(self, projector: Projector) -> None:
+        self._projector = projector
+        self._light = np.zeros((projector.height, projector.width, 3), np.float32)
+
+    def stroke(self, g: Guided, patches: Sequence[Patch], s: GuideSettings, dashed: bool) -> None:
+        """Paints what of a stroke is visible."""
+        color = linear(g.stroke.color).astype(np.float32) * np.float32(s.brightness)
+        for patch in patches:
+            self._paint(patch.share, patch.top, patch.left, color)
+        parts = [ribbons_of(t, a, b, s.dash_mm if dashed else None) for t in g.traces for a, b in visible_runs(t)]
+        if not parts:
+            return
+        every = np.concatenate(parts)
+        if not len(every):
+            return
+        reach = np.maximum(every[:, 2], every[:, 5]).max() + 2
+        h = self._projector.height
+        top = int(np.clip(math.floor(every[:, [1, 4]].min() - reach), 0, h - 1))
+        end = int(np.clip(math.ceil(every[:, [1, 4]].max() + reach) + 1, top + 1, h))
+        share = np.zeros((end - top, self._projector.width), np.float32)
+        k.ribbons(every, self._projector.layout is Layout.DIAMOND, top, share)
+        self._paint(share, top, 0, color)
+
+    def _paint(self, share: F32, top: int, left: int, color: F32) -> None:
+        if left < 0 or top < 0:
+            share, left, top = share[max(-top, 0) :, max(-left, 0) :], max(left, 0), max(top, 0)
+        part = self._light[top : top + share.shape[0], left : left + share.shape[1]]
+        share = share[: part.shape[0], : part.shape[1]]
+        rows, columns = np.flatnonzero(share.any(1)), np.flatnonzero(share.any(0))
+        if not rows.size:
+            return
+        cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        a = share[cut][..., None]
+        part[cut] = part[cut] * (1 - a) + a * color
+
+    def image(self) -> U8:
+        """The picture (height, width, 3) RGB."""
+        out: U8 = np.clip(np.rint(self._light * 255), 0, 255).astype(np.uint8)
+        return out
+
+
+def ribbons_of(t: Trace, first: int, last: int, dash_mm: float | None) -> F64:
+    """Parts (m, 6) of a visible run of a trace, as kernels draw them; with `dash_mm` only the dashes."""
+    uv, half = t.uv[first:last], t.half[first:last]
+    out = np.column_stack([uv[:-1], half[:-1], uv[1:], half[1:]])
+    if dash_mm is not None:
+        gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(t.xyz[first:last], axis=0), axis=1))])
+        on = (gone[:-1] % (2 * dash_mm)) < dash_mm
+        out = out[on]
+    return np.ascontiguousarray(out[np.isfinite(out).all(1)])
+
+
+def drawn_rows(image: U8) -> list[tuple[int, int]]:
+    """Runs of rows of a picture in which something is lit."""
+    lit = np.asarray(image.reshape(len(image), -1).any(1))
+    return [(a, b) for a, b in runs(lit) if lit[a]]
