@@ -441,6 +441,66 @@ def test_the_ring_light_lights_all_and_needs_no_projector():
     assert (r.signal("camera1", None, ring=0.5) - off) == pytest.approx((on - off) / 2, rel=1e-4)
 
 
+# ----------------------------------------------------------------------------------------------- lamps of three colours
+
+
+@pytest.mark.parametrize(("preset", "name"), [("pair", "tissue-folded"), ("single", "sphere")])
+def test_the_three_lamps_together_are_the_white_one(preset, name, rng):
+    inst = presets.instrument(preset, 0.03)
+    p = inst.rig.projector
+    r = render.Renderer(scene.make(name, 1), inst)
+    image = rng.integers(0, 256, (p.height, p.width)).astype(np.uint8)
+    grey = r.signal("camera1", image, ring=0.2, leds=0.6)
+    assert list(r._views) == [("camera1", False)]  # who shows no colour pays for none
+    same = r.signal("camera1", np.repeat(image[..., None], 3, 2), ring=0.2, leds=0.6)
+    assert np.abs(same - grey).max() < 2e-6 * grey.max()
+    off = r.signal("camera1", None, ring=0.2)
+    parts = [r.signal("camera1", image, ring=0.2, leds=tuple(0.6 * np.eye(3)[k])) - off for k in range(3)]
+    assert np.abs(sum(parts) - (grey - off)).max() < 5e-6 * grey.max()
+    assert all(a.mean() > 0.05 * (grey - off).mean() for a in parts)
+
+
+def test_a_lamp_is_seen_through_the_filters_of_the_sensor():
+    """On a white plate each colour's share of a pixel is what its filter lets through of it: by the numbers alone."""
+    inst = presets.instrument("pair", SCALE).ideal()
+    p = inst.rig.projector
+    r = render.Renderer(plane_at(0), inst)
+    full = np.full((p.height, p.width), 255, np.uint8)
+    lit = r.truth("camera1").lit
+    middle = np.zeros(lit.shape, bool)
+    middle[lit.shape[0] // 4 : -(lit.shape[0] // 4), lit.shape[1] // 4 : -(lit.shape[1] // 4)] = True
+    filters, light = np.array(inst.sensor.filters), np.array(inst.projector_colour)
+    for k in range(3):
+        alone = np.zeros((p.height, p.width, 3), np.uint8)
+        alone[..., k] = 255
+        share = r.signal("camera1", alone) / np.maximum(r.signal("camera1", full), 1e-9)
+        for y, x in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            sites, row = np.s_[y::2, x::2], x + y  # R G over G B
+            expected = filters[row, k] * light[k] / (filters[row] @ light)
+            here = middle[sites] & lit[sites]
+            assert here.sum() > 1000
+            assert np.median(share[sites][here]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_red_line_on_red_tissue_is_bright_and_a_blue_one_is_not():
+    inst = presets.instrument("pair", SCALE).ideal()
+    p = inst.rig.projector
+    r = render.Renderer(plane_at(0, textures.Finish(textures.uniform((0.7, 0.1, 0.05)))), inst)
+    picture = np.zeros((p.height, p.width, 3), np.uint8)
+    picture[:, : p.width // 2, 0], picture[:, p.width // 2 :, 2] = 255, 255
+    s, t = r.signal("camera1", picture).astype(float), r.truth("camera1")
+    left = t.lit & (t.uv[..., 0] > 100) & (t.uv[..., 0] < 800)
+    right = t.lit & (t.uv[..., 0] > 1000) & (t.uv[..., 0] < 1700)
+    assert np.median(s[0::2, 0::2][left[0::2, 0::2]]) > 3 * np.median(s[1::2, 1::2][right[1::2, 1::2]])
+
+
+def test_pictures_that_no_projector_shows_are_refused():
+    r = render.Renderer(plane_at(0), presets.instrument("single", SCALE))
+    for shape in ((1140, 912, 2), (912, 1140, 3), (1140,)):
+        with pytest.raises(UsageError, match="shows"):
+            r.signal("camera1", np.zeros(shape, np.uint8))
+
+
 # ------------------------------------------------------------------------------------------------- scenes and presets
 
 

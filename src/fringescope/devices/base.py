@@ -10,192 +10,64 @@ from __future__ import annotations
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from enum import Enum
-from types import MappingProxyType, TracebackType
-from typing import Any, NamedTuple, Self
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 
+from fringescope.devices.killswitch import Cut, KillSwitch, Latch
+from fringescope.devices.values import (
+    DARK_GAP_US,
+    FULL,
+    CameraInfo,
+    CameraSettings,
+    Exposure,
+    Frame,
+    Held,
+    Leds,
+    LightInfo,
+    LoadedShot,
+    PatternRef,
+    ProjectorInfo,
+    Roi,
+    Shot,
+    Shutter,
+    Trigger,
+    TriggerSource,
+)
 from fringescope.errors import DeviceError, RejectedError
-from fringescope.types import U8, AnyArray, Layout, PixelFormat
+from fringescope.types import U8
 
-DARK_GAP_US = 230  #: a DLPC350 needs this much dark time after an exposure, or none at all
-
-
-# ----------------------------------------------------------------------------------------------------------- values
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """How long each pattern is lit, and from one pattern's start to the next. Raises RejectedError for an impossible
-    pair.
-    """
-
-    duration_us: int
-    period_us: int
-
-    def __post_init__(self) -> None:
-        gap = self.period_us - self.duration_us
-        if self.duration_us < 1 or gap < 0 or 0 < gap < DARK_GAP_US:
-            raise RejectedError(
-                f"exposure {self.duration_us} us in a period of {self.period_us} us; "
-                f"needed period = exposure, or at least {DARK_GAP_US} us longer"
-            )
-
-
-@dataclass(frozen=True)
-class Leds:
-    """Brightness of the projector's red, green and blue lamps, 0..1."""
-
-    red: float = 1.0
-    green: float = 1.0
-    blue: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name, value in (("red", self.red), ("green", self.green), ("blue", self.blue)):
-            if not 0.0 <= value <= 1.0:
-                raise RejectedError(f"LED {name} {value}; needed 0 to 1")
-
-
-@dataclass(frozen=True, eq=False)
-class PatternRef:
-    """One picture to show: (height, width) uint8 in device pixels, and a label for messages and logs."""
-
-    image: U8
-    label: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """The compiled, checkable unit of work: patterns in order, each shown once for one exposure."""
-
-    patterns: tuple[PatternRef, ...]
-    exposure: Exposure
-    leds: Leds = field(default_factory=Leds)
-
-    def __post_init__(self) -> None:
-        if not self.patterns:
-            raise RejectedError("a shot without patterns; needed at least one")
-
-
-class Shutter(Enum):
-    """How a sensor ends its exposure."""
-
-    GLOBAL = "global"
-    ROLLING = "rolling"
-
-
-class Roi(NamedTuple):
-    """Part of a sensor, pixels."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-
-@dataclass(frozen=True)
-class CameraInfo:
-    """What a camera is: sensor size in pixels, formats, shutter, and how long the full frame takes to read out."""
-
-    uri: str
-    model: str
-    serial: str
-    width: int
-    height: int
-    pixel_formats: tuple[PixelFormat, ...]
-    shutter: Shutter
-    readout_us: int
-    min_exposure_us: int = 10
-    max_exposure_us: int = 30_000_000
-    extra: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-    def readout_of(self, roi: Roi | None) -> int:
-        """Readout time in us of part of the sensor: in proportion to its rows."""
-        return self.readout_us if roi is None else math.ceil(self.readout_us * roi.height / self.height)
-
-
-@dataclass(frozen=True)
-class CameraSettings:
-    """How a camera shall record: None leaves what the device has."""
-
-    pixel_format: PixelFormat
-    exposure_us: int
-    gain: float = 1.0  #: linear
-    roi: Roi | None = None
-
-
-class TriggerSource(Enum):
-    """What starts an exposure."""
-
-    LINE = "line"  #: a rising edge of the projector
-    SOFTWARE = "software"  #: `Acquisition.trigger`
-
-
-@dataclass(frozen=True)
-class Trigger:
-    """What starts each exposure, and how long to wait for the frame that follows."""
-
-    source: TriggerSource = TriggerSource.LINE
-    timeout_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.timeout_s) and self.timeout_s > 0):
-            raise RejectedError(f"trigger timeout {self.timeout_s} s; needed a positive number")
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One frame as the device sent it.
-
-    `block_id` counts the device's exposures, contiguous unless something was lost. `device_ns`: start of exposure on
-    the device's clock, None where it has none. `host_ns`: arrival. `complete`: False if part of the buffer never came.
-    """
-
-    pixels: AnyArray
-    pixel_format: PixelFormat
-    block_id: int
-    device_ns: int | None
-    host_ns: int
-    complete: bool = True
-    chunks: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-
-@dataclass(frozen=True)
-class ProjectorInfo:
-    """What a projector is: device pixels, where they lie on its plane, and its limits."""
-
-    uri: str
-    model: str
-    serial: str
-    width: int
-    height: int
-    layout: Layout
-    min_exposure_us: int
-    max_patterns: int
-    extra: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-
-@dataclass(frozen=True)
-class LightInfo:
-    """What a light is."""
-
-    uri: str
-    model: str
-
-
-@dataclass(frozen=True, eq=False)
-class LoadedShot:
-    """A shot that a projector has accepted, with the timing that it will really keep."""
-
-    shot: Shot
-    exposure: Exposure
-    token: int
-
-
-# ---------------------------------------------------------------------------------------------------------- devices
+__all__ = [
+    "DARK_GAP_US",
+    "FULL",
+    "Acquisition",
+    "Camera",
+    "CameraInfo",
+    "CameraSettings",
+    "Cut",
+    "Device",
+    "Exposure",
+    "Frame",
+    "Held",
+    "KillSwitch",
+    "Leds",
+    "Light",
+    "LightInfo",
+    "LoadedShot",
+    "PatternRef",
+    "Projector",
+    "ProjectorInfo",
+    "Roi",
+    "Running",
+    "Shot",
+    "Shutter",
+    "Station",
+    "Trigger",
+    "TriggerSource",
+]
 
 
 class Device:
@@ -349,7 +221,16 @@ class Running(ABC):
 
 
 class Projector(Device, ABC):
-    """A projector that plays patterns and emits an edge with each."""
+    """A projector that plays patterns and emits an edge with each, or holds one picture.
+
+    After a cut through its kill switch it is dark and refuses to show or fire until `release`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._held: Held | None = None
+        self._running: Running | None = None
+        self._latch: Latch | None = None
 
     @property
     @abstractmethod
@@ -377,9 +258,102 @@ class Projector(Device, ABC):
         return self._load(shot)
 
     def fire(self, loaded: LoadedShot) -> Running:
-        """Plays a loaded shot once, from its first pattern. Raises RejectedError if another shot was loaded since."""
+        """Plays a loaded shot once, from its first pattern; a picture that was held, or a shot that runs, ends.
+
+        Raises RejectedError if another shot was loaded since, and after a cut.
+        """
         self._check_open()
-        return self._fire(loaded)
+        with self._lock:
+            self._check_uncut()
+            self.dark()
+            self._running = running = self._fire(loaded)
+        return running
+
+    def show(self, image: U8, leds: Leds = FULL) -> None:
+        """Holds a picture, (height, width) or (height, width, 3) RGB uint8 device pixels, until `dark`, another `show`
+        or `fire`; a shot that runs ends.
+
+        Raises RejectedError for a picture of another size or type, colour on a projector without, and after a cut.
+        """
+        self._check_open()
+        i, shape, kind = self.info, getattr(image, "shape", ()), getattr(image, "dtype", type(image).__name__)
+        if shape not in ((i.height, i.width), (i.height, i.width, 3)) or kind != np.uint8:
+            raise RejectedError(
+                f"{i.uri}: a picture of {shape} {kind}; "
+                f"needed ({i.height}, {i.width}) or ({i.height}, {i.width}, 3) uint8"
+            )
+        if len(shape) == 3 and not i.colours:
+            raise RejectedError(f"{i.uri}: a coloured picture; it shows grey ones, ({i.height}, {i.width}) uint8")
+        own = np.array(image, order="C")
+        own.flags.writeable = False
+        with self._lock:
+            self._check_open()
+            self._check_uncut()
+            if self._running is not None:
+                self.dark()
+            self._show(own, leds)
+            self._held = Held(own, leds)
+
+    def dark(self) -> None:
+        """Nothing is projected any more within 100 ms; a shot that runs ends. May be called in any state, any number of
+        times and from any thread.
+        """
+        with self._lock:
+            self._held = None
+            running, self._running = self._running, None
+            if running is not None:
+                running.cancel()
+            if not self._closed:
+                self._dark()
+
+    @property
+    def held(self) -> Held | None:
+        """What is held now, with its lamps; None = dark, or a shot runs."""
+        held = self._held
+        return None if self.cut is not None else held
+
+    @property
+    def shown(self) -> U8 | None:
+        """The picture that is held now, read-only; None = dark, or a shot runs."""
+        held = self.held
+        return None if held is None else held.image
+
+    def kill_switch(self) -> KillSwitch:
+        """What turns this projector dark from any process, whatever this one does; it can be sent there."""
+        with self._lock:
+            self._check_open()
+            if self._latch is None:
+                self._latch = Latch.create()
+            return self._kill_switch(self._latch.path)
+
+    @property
+    def cut(self) -> Cut | None:
+        """The cut through a kill switch that holds, None while there is none."""
+        return None if self._latch is None else self._latch.read(Latch.CUT)
+
+    def release(self) -> None:
+        """Lifts a cut. The projector stays dark: what it held before is not shown again."""
+        self._check_open()
+        with self._lock:
+            self.dark()
+            if self._latch is not None:
+                self._latch.clear()
+
+    def close(self) -> None:
+        """Dark, then releases the device. May be called twice, and from any thread."""
+        with self._lock:
+            try:
+                self.dark()
+            finally:
+                super().close()
+                if self._latch is not None:
+                    self._latch.mark(Latch.CUT, "the projector was closed")
+                    self._latch.remove()
+
+    def _check_uncut(self) -> None:
+        latch = self._latch
+        if latch is not None and (cut := latch.read(Latch.CUT) or latch.read(Latch.ASKED)) is not None:
+            raise RejectedError(f"{self.info.uri}: kept dark ({cut.why}); release() it first")
 
     @abstractmethod
     def _load(self, shot: Shot) -> LoadedShot:
@@ -388,6 +362,18 @@ class Projector(Device, ABC):
     @abstractmethod
     def _fire(self, loaded: LoadedShot) -> Running:
         """Hook."""
+
+    @abstractmethod
+    def _show(self, image: U8, leds: Leds) -> None:
+        """Hook: holds a picture that nobody changes any more."""
+
+    @abstractmethod
+    def _dark(self) -> None:
+        """Hook: no light, within 100 ms."""
+
+    @abstractmethod
+    def _kill_switch(self, latch: str) -> KillSwitch:
+        """Hook: the switch, on the latch's file, that reaches the device from another process."""
 
 
 class Light(Device, ABC):

@@ -1,7 +1,8 @@
 """A stored capture poses as the instrument that recorded it: `file:///folder#camera1`, `#projector`, `#light`.
 
 The projector accepts any shot; with each edge, every armed camera gives the next frame of its own view, in the
-order of the capture's plan. While the light is on, it gives the ring-light picture instead.
+order of the capture's plan. While the light is on, it gives the ring-light picture instead. A picture may be shown, but
+not photographed.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class Recording:
         self.capture = store.read_capture(folder)
         self.line: virtual.TriggerLine[_Edge] = virtual.TriggerLine()
         self.ring = 0.0
+        self.projector: base.Projector | None = None
         self._clock = 0
         self._lock = threading.Lock()
 
@@ -45,14 +47,14 @@ class Recording:
 
 
 class ReplayProjector(virtual.VirtualProjector):
-    """Plays nothing, but emits the edges."""
+    """Plays nothing, but emits the edges, and holds any picture."""
 
     def __init__(self, recording: Recording, uri: str) -> None:
         c = recording.capture
-        super().__init__(
-            base.ProjectorInfo(uri, "stored capture", "", c.projector_width, c.projector_height, c.layout, 1, 65536)
-        )
+        w, h = c.projector_width, c.projector_height
+        super().__init__(base.ProjectorInfo(uri, "stored capture", "", w, h, c.layout, 1, 65536, True))
         self._recording = recording
+        recording.projector = self
 
     def _play(self, loaded: base.LoadedShot) -> base.Running:
         return _ReplayRunning(self._recording, loaded)
@@ -113,6 +115,11 @@ class _ReplayAcquisition(virtual.VirtualAcquisition[_Edge]):
         self._source, self._recording = camera, recording
 
     def _own_edge(self) -> _Edge:
+        p = self._recording.projector
+        if p is not None and p.shown is not None:
+            raise RejectedError(
+                f"{self._source.info.uri}: a stored capture cannot photograph a new picture; make the projector dark"
+            )
         return _Edge(time.monotonic_ns(), self._recording.ring > 0)
 
     def _frame(self, edge: _Edge, number: int, block: int) -> base.Frame:

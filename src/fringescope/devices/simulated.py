@@ -1,7 +1,8 @@
 """The simulated instrument: projector, cameras and ring light of one world, on one virtual clock and trigger line.
 
-A camera records what the projector shows and the ring light gives at the moment of the edge. Time is virtual: nothing
-waits for the exposure to pass. Faults can be injected to see that they are found.
+A camera records what the projector shows and the ring light gives at the moment of the edge: a pattern of a shot, or,
+when the camera is triggered by software, the picture that the projector holds. Time is virtual: nothing waits for the
+exposure to pass. Faults can be injected to see that they are found.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from fringescope.devices import base, virtual
 from fringescope.errors import DeviceLostError, DeviceTimeoutError, UsageError
 from fringescope.twin import presets, render, scene
-from fringescope.types import U8, AnyArray, PixelFormat, Rig
+from fringescope.types import AnyArray, PixelFormat, Rig
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,7 @@ class _Edge:
     number: int
     at_ns: int
     period_ns: int
-    image: U8 | None
-    leds: float
+    held: base.Held | None  #: what the projector shows
     lit_us: int
     ring: float
 
@@ -69,6 +69,7 @@ class World:
         self.faults = faults or Faults()
         self.renderer = render.Renderer(view, instrument, rays)
         self.ring = 0.0
+        self.projector: base.Projector | None = None  #: whose light falls on the scene
         self.line: virtual.TriggerLine[_Edge] = virtual.TriggerLine()
         self._clock_ns = 1_000_000_000
         self._lock = threading.Lock()
@@ -88,40 +89,37 @@ class World:
         lit = (
             min(edge.lit_us, settings.exposure_us) / settings.exposure_us
         )  # the projector is dark outside its exposure
+        image = None if edge.held is None else edge.held.image
+        leds = base.FULL if edge.held is None else edge.held.leds
+        lamps = (lit * leds.red, lit * leds.green, lit * leds.blue)
         with self._render_lock:
             full = self.renderer.frame(
-                camera,
-                edge.image,
-                rng,
-                settings.exposure_us,
-                edge.ring,
-                settings.gain,
-                edge.leds * lit,
-                settings.pixel_format,
+                camera, image, rng, settings.exposure_us, edge.ring, settings.gain, lamps, settings.pixel_format
             )
         r = settings.roi
         return full if r is None else full[r.top : r.top + r.height, r.left : r.left + r.width]
 
 
 class SimulatedProjector(virtual.VirtualProjector):
-    """A DLP4500 that plays any number of 8-bit patterns."""
+    """A DLP4500 that plays any number of 8-bit patterns, and holds pictures in colour."""
 
     def __init__(self, world: World, uri: str) -> None:
         p = world.instrument.rig.projector
         super().__init__(
-            base.ProjectorInfo(uri, "simulated DLP4500", "sim", p.width, p.height, p.layout, 8333, 4096)
+            base.ProjectorInfo(uri, "simulated DLP4500", "sim", p.width, p.height, p.layout, 8333, 4096, True)
         )
         self._world = world
+        world.projector = self
 
     def _play(self, loaded: base.LoadedShot) -> base.Running:
-        return _SimulatedRunning(self._world, loaded)
+        return _SimulatedRunning(self._world, self, loaded)
 
 
 class _SimulatedRunning(base.Running):
-    """Plays its edges in a thread of its own."""
+    """Plays its edges in a thread of its own, until a cut."""
 
-    def __init__(self, world: World, loaded: base.LoadedShot) -> None:
-        self._world, self._loaded = world, loaded
+    def __init__(self, world: World, projector: SimulatedProjector, loaded: base.LoadedShot) -> None:
+        self._world, self._projector, self._loaded = world, projector, loaded
         self._edges: list[int] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._play, name="simulated projector", daemon=True)
@@ -129,16 +127,14 @@ class _SimulatedRunning(base.Running):
 
     def _play(self) -> None:
         shot, period = self._loaded.shot, self._loaded.exposure.period_us * 1000
-        leds = (shot.leds.red + shot.leds.green + shot.leds.blue) / 3
         for k, p in enumerate(shot.patterns):
-            if self._stop.is_set():
+            if self._stop.is_set() or self._projector.cut is not None:
                 return
             shown = shot.patterns[k - 1] if k and k in self._world.faults.repeat else p
             at = self._world.advance(period)
             self._edges.append(at)
-            self._world.line.rise(
-                _Edge(k, at, period, shown.image, leds, self._loaded.exposure.duration_us, self._world.ring)
-            )
+            held = base.Held(shown.image, shot.leds)
+            self._world.line.rise(_Edge(k, at, period, held, self._loaded.exposure.duration_us, self._world.ring))
 
     def wait(self, timeout_s: float) -> None:
         """See `base.Running`."""
@@ -188,8 +184,9 @@ class _SimulatedAcquisition(virtual.VirtualAcquisition[_Edge]):
 
     def _own_edge(self) -> _Edge:
         exposure_us = self._settings.exposure_us
-        period = exposure_us * 1000
-        return _Edge(0, self._world.advance(period), period, None, 0.0, exposure_us, self._world.ring)
+        period, projector = exposure_us * 1000, self._world.projector
+        held = None if projector is None else projector.held
+        return _Edge(0, self._world.advance(period), period, held, exposure_us, self._world.ring)
 
     def _frame(self, edge: _Edge, number: int, block: int) -> base.Frame | None:
         f = self._world.faults

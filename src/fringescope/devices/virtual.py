@@ -11,6 +11,7 @@ from typing import Generic, Protocol, TypeVar
 
 from fringescope.devices import base
 from fringescope.errors import DeviceTimeoutError, RejectedError
+from fringescope.types import U8
 
 E = TypeVar("E")  #: what an edge tells the cameras
 
@@ -44,7 +45,7 @@ class TriggerLine(Generic[E]):
 
 
 class VirtualProjector(base.Projector):
-    """Remembers which shot was loaded last; a subclass says how it plays (`_play`)."""
+    """Remembers which shot was loaded last; a subclass says how it plays (`_play`). Its lamp burns through a latch."""
 
     def __init__(self, info: base.ProjectorInfo) -> None:
         super().__init__()
@@ -63,6 +64,15 @@ class VirtualProjector(base.Projector):
         if loaded.token != self._loaded:
             raise RejectedError(f"{self._info.uri}: this shot is no longer loaded; load it again")
         return self._play(loaded)
+
+    def _show(self, image: U8, leds: base.Leds) -> None:
+        """Nothing to send: cameras ask what is `held`."""
+
+    def _dark(self) -> None:
+        """Nothing to send, either."""
+
+    def _kill_switch(self, latch: str) -> base.KillSwitch:
+        return base.KillSwitch(latch)  # the lamp burns through the latch
 
     @abstractmethod
     def _play(self, loaded: base.LoadedShot) -> base.Running:

@@ -9,7 +9,7 @@ no phase.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -45,8 +45,11 @@ class ViewTruth:
     shape: AnyArray
 
 
+_Lights = tuple[tuple[float, float, float], ...]  #: red, green, blue of lamps
+
+
 class _Sparse(NamedTuple):
-    """Further rays: the pixel that each belongs to, where it lands, its blur (plane units) and its gain."""
+    """Further rays: the pixel that each belongs to, where it lands, its blur (plane units) and its gains (n, lamps)."""
 
     pixel: AnyArray
     u: F32
@@ -56,10 +59,10 @@ class _Sparse(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """What rays (n,) found: hits, response to body colour (projector's, ring's, room's light), film, scattering."""
+    """What rays (n,) found: hits, response to body colour (lamps', ring's, room's light), film, scattering."""
 
     hits: Hits
-    colours: F64  #: (3, n)
+    colours: F64  #: (lamps + 2, n)
     alpha: F64
     f0: F64
     scatter: F64
@@ -67,7 +70,7 @@ class _Surface(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Rays (n,) with their projector light."""
+    """Rays (n,) with their projector light; `gain` (n, lamps)."""
 
     surface: _Surface
     uv: F64
@@ -80,8 +83,8 @@ class _Rays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Geometry of one camera: per pixel where it looks (columns, rows and levels of the light stack), gain, steady and
-    ring light.
+    """Geometry of one camera: per pixel where it looks (columns, rows and levels of the light stack), gains (lamps, n),
+    steady and ring light. The first lamp is the projector's white one.
     """
 
     stack: optics.LightStack
@@ -89,7 +92,8 @@ class _View:
     y: F32
     level: F32
     gain: F32
-    more: tuple[AnyArray, F32, F32, F32, F32]  #: pixel, x, y, level, gain
+    more: tuple[AnyArray, F32, F32, F32]  #: pixel, x, y, level
+    more_gain: F32  #: (lamps, m)
     steady: F32
     ring: F32
     stray: F32  #: gain by way of other surfaces
@@ -108,28 +112,36 @@ class Renderer:
             raise UsageError(f"rays {rays}; needed 1, 4 or 16 per pixel")
         self.scene, self.instrument = scene, instrument
         self._rays, self._mirrors = rays or scene.rays, mirrors
-        self._views: dict[str, _View] = {}
+        self._views: dict[tuple[str, bool], _View] = {}
         p = instrument.rig.projector
         self._aspect = float(p.lens.K[0, 0] / p.lens.K[1, 1])
         self._centre = -p.pose.R.T @ p.pose.t
 
     # ---------------------------------------------------------------------------------------------------- pictures
 
-    def signal(self, camera: str, image: U8 | None, ring: float = 0.0, leds: float = 1.0) -> F32:
+    def signal(
+        self, camera: str, image: U8 | None, ring: float = 0.0, leds: float | tuple[float, float, float] = 1.0
+    ) -> F32:
         """Noise-free signal (H, W) while the projector shows `image` (None: lamp off); 1 = a white surface fully lit.
 
-        `ring`: level of the ring light, 0..1; `leds`: brightness of the projector's lamp, 0..1.
+        `image`: (height, width) or (height, width, 3), red, green, blue. `ring`: level of the ring light, 0..1; `leds`:
+        brightness of the lamp, or of its three colours, 0..1, which together are the white one.
         """
-        cam = self.instrument.rig.camera(camera)
-        view = self._view(cam)
+        cam, inst = self.instrument.rig.camera(camera), self.instrument
+        three = leds if isinstance(leds, tuple) else (leds,) * 3
+        coloured = image is not None and (image.shape[2:] == (3,) or len(set(three)) > 1)
+        view = self._view(cam, coloured)
         steady = view.steady + np.float32(ring * self.scene.ring) * view.ring if ring else view.steady
         out = steady.copy()
-        if image is not None and leds > 0:
-            light = optics.mirror_light(image, self.instrument.rig.projector, self.instrument.projector)
-            levels = view.stack.build(light * np.float32(leds * self.scene.lamp))
-            loops.gather(levels, view.x, view.y, view.level, view.gain, steady, out)
-            pixel, x, y, level, gain = view.more
-            loops.gather_sparse(levels, pixel, x, y, level, gain, out)
+        if image is not None:
+            channels = np.moveaxis(image, -1, 0) if image.shape[2:] == (3,) else [image] * 3
+            for gain, more, channel, level in zip(view.gain, view.more_gain, channels, three, strict=False):
+                if level > 0:
+                    light = optics.mirror_light(channel, inst.rig.projector, inst.projector)
+                    levels = view.stack.build(light * np.float32(level * self.scene.lamp))
+                    loops.gather(levels, view.x, view.y, view.level, gain, out, out)
+                    pixel, x, y, depth = view.more
+                    loops.gather_sparse(levels, pixel, x, y, depth, more, out)
         return out.reshape(cam.lens.height, cam.lens.width)
 
     def frame(
@@ -140,7 +152,7 @@ class Renderer:
         exposure_us: float | None = None,
         ring: float = 0.0,
         gain: float = 1.0,
-        leds: float = 1.0,
+        leds: float | tuple[float, float, float] = 1.0,
         pixel_format: PixelFormat | None = None,
     ) -> AnyArray:
         """Raw codes (H, W), or (H, W, 3) for RGB8, as the sensor gives them; without `rng` no noise is drawn."""
@@ -166,7 +178,7 @@ class Renderer:
             hit = (hits.shape >= 0)[:, None]
             xyz[k], uv[k], shape[k] = np.where(hit, hits.point, np.nan), np.where(hit, uvz[:, :2], np.nan), hits.shape
         view = self._view(cam)
-        total = view.gain + np.bincount(view.more[0], view.more[4], h * w)
+        total = view.gain[0] + np.bincount(view.more[0], view.more_gain[0], h * w)
         share = np.divide(view.stray, total, out=np.zeros(h * w, np.float32), where=total > 0, casting="unsafe")
         return ViewTruth(
             xyz.reshape(h, w, 3), uv.reshape(h, w, 2), light.reshape(h, w), share.reshape(h, w), shape.reshape(h, w)
@@ -179,14 +191,25 @@ class Renderer:
         step, n = max(2, TILE // cam.lens.width // 2 * 2) * cam.lens.width, cam.lens.width * cam.lens.height
         return [slice(k, min(k + step, n)) for k in range(0, n, step)]
 
-    def _view(self, cam: Camera) -> _View:
-        if cam.name not in self._views:
-            self._views[cam.name] = self._make(cam)
-        return self._views[cam.name]
+    def _view(self, cam: Camera, coloured: bool = False) -> _View:
+        """The white lamp's view, or the three coloured lamps': with gains of their own in the white one's geometry."""
+        if (cam.name, coloured) not in self._views:
+            white = self.instrument.projector_colour
+            if coloured:
+                three = ((white[0], 0.0, 0.0), (0.0, white[1], 0.0), (0.0, 0.0, white[2]))
+                made = self._make(cam, (white, *three))
+                made = replace(self._view(cam), gain=made.gain[1:], more_gain=made.more_gain[1:])
+            else:
+                made = self._make(cam, (white,))
+            self._views[cam.name, coloured] = made
+        return self._views[cam.name, coloured]
 
-    def _make(self, cam: Camera) -> _View:
+    def _make(self, cam: Camera, lamps: _Lights) -> _View:
+        """Traces a camera's rays. What is traced, and what is left out, depends on the first lamp alone."""
         h, w = cam.lens.height, cam.lens.width
-        u, v, sigma, gain, steady, ring, stray, spread = (np.zeros(h * w, np.float32) for _ in range(8))
+        u, v, sigma, steady, ring, stray, spread = (np.zeros(h * w, np.float32) for _ in range(7))
+        gains = np.zeros((len(lamps), h * w), np.float32)
+        gain = gains[0]
         shape, light = np.empty(h * w, np.int16), np.empty(h * w, bool)
         shadow = np.empty((self.instrument.ring.lamps, h * w), bool)
         found: list[_Sparse] = []
@@ -194,38 +217,39 @@ class Renderer:
         for k in self._tiles(cam):
             index = np.arange(k.start, k.stop)
             origin, d = optics.look(cam.lens, cam.pose, _pixels(cam, index))
-            rays = self._shade(cam, origin, d, index)
-            u[k], v[k], sigma[k], gain[k], steady[k] = rays.uv[:, 0], rays.uv[:, 1], rays.sigma, rays.gain, rays.room
+            rays = self._shade(cam, origin, d, index, lamps)
+            u[k], v[k], sigma[k], gains[:, k] = rays.uv[:, 0], rays.uv[:, 1], rays.sigma, rays.gain.T
+            steady[k] = rays.room
             shape[k], light[k] = rays.surface.hits.shape, rays.lit
             spread[k] = self._spread(cam, rays.surface.hits, origin)
             glossy.append(rays.mirrored)
             seen = self._ring_shadows(rays.surface.hits, w)
             ring[k] = self._ring(cam, rays.surface, d, seen, index)
             shadow[:, k] = seen
-        gain[~light] = 0.0
-        foot, rough = _footprint(
-            u.reshape(h, w), v.reshape(h, w), gain.reshape(h, w), shape.reshape(h, w), self._aspect
-        )
+        gains[:, ~light] = 0.0
+        size = (h, w)
+        at, kind = (u.reshape(size), v.reshape(size)), shape.reshape(size)
+        foot, rough = _footprint(*at, gain.reshape(size), kind, self._aspect)
         one = _joined(glossy)
-        one = one._replace(sigma=np.hypot(one.sigma, _reach(one, (h, w), self._aspect) * spread[one.pixel]))
+        one = one._replace(sigma=np.hypot(one.sigma, _reach(one, size, self._aspect) * spread[one.pixel]))
         if self._rays > 1:
             edges = np.flatnonzero(rough)
             one = one._replace(**_pick(one, ~rough[one.pixel]))
-            gain[edges] = steady[edges] = ring[edges] = 0.0
+            gains[:, edges] = steady[edges] = ring[edges] = 0.0
             offsets, weight = _quadrature(self._rays), 1.0 / self._rays
             for part in np.array_split(edges, len(edges) // TILE + 1):
                 base = _pixels(cam, part)
                 for o in offsets:
                     origin, d = optics.look(cam.lens, cam.pose, base + spread[part, None] * o)
-                    rays = self._shade(cam, origin, d, part)
+                    rays = self._shade(cam, origin, d, part, lamps)
                     steady[part] += weight * rays.room
                     ring[part] += weight * self._ring(cam, rays.surface, d, shadow[:, part], part)
-                    on = np.flatnonzero(rays.lit & (rays.gain > 0))
+                    on = np.flatnonzero(rays.lit & (rays.gain[:, 0] > 0))
                     numbers = (*rays.uv[on].T, rays.sigma[on], weight * rays.gain[on])
                     direct = _Sparse(part[on], *(a.astype(np.float32) for a in numbers))
                     found += [direct, rays.mirrored._replace(gain=np.float32(weight) * rays.mirrored.gain)]
-                    np.add.at(stray, rays.mirrored.pixel, np.float32(weight) * rays.mirrored.gain)
-        np.add.at(stray, one.pixel, one.gain)
+                    np.add.at(stray, rays.mirrored.pixel, np.float32(weight) * rays.mirrored.gain[:, 0])
+        np.add.at(stray, one.pixel, one.gain[:, 0])
         sigma = np.sqrt(sigma**2 + (foot.ravel() * spread) ** 2)
         more = _spread_out(_joined([one, *found]), self._aspect)
         smooth = gain > 0
@@ -234,8 +258,9 @@ class Renderer:
         low = float(np.percentile(sigma[smooth], 2)) if smooth.any() else 1.0
         high = max([low, *(float(a.max()) for a in (sigma[smooth], more.sigma) if a.size)])
         stack = optics.LightStack(optics.blur_levels(low, min(high, MOST_BLUR)), self._aspect)
-        lookups = (more.pixel, *stack.place(more.sigma, more.u, more.v), more.gain)
-        return _View(stack, *stack.place(sigma, u, v), gain, lookups, steady, ring, stray)
+        lookups = (more.pixel, *stack.place(more.sigma, more.u, more.v))
+        more_gain = np.ascontiguousarray(more.gain.T)
+        return _View(stack, *stack.place(sigma, u, v), gains, lookups, more_gain, steady, ring, stray)
 
     def _spread(self, cam: Camera, hits: Hits, origin: F64) -> F64:
         """Standard deviation (n,) in pixels of pixel area and defocus together."""
@@ -257,7 +282,7 @@ class Renderer:
         ok[k] = lit(self.scene.shapes, hits.point[k], hits.normal[k], self._centre)
         return uvz, ok
 
-    def _surface(self, cam: Camera, hits: Hits, d: F64, pixel: AnyArray) -> _Surface:
+    def _surface(self, cam: Camera, hits: Hits, d: F64, pixel: AnyArray, lamps: _Lights) -> _Surface:
         n = len(hits.t)
         albedo, alpha, f0, scatter = np.zeros((n, 3)), np.full(n, 0.3), np.zeros(n), np.zeros(n)
         shiny = hits.normal.copy()
@@ -273,8 +298,8 @@ class Renderer:
                 shiny[k] = b / np.linalg.norm(b, axis=1, keepdims=True)
         fall = np.clip(d @ cam.pose.R[2], 0, 1) ** self.instrument.camera.falloff
         inst = self.instrument
-        colours = np.empty((3, n))
-        for j, light in enumerate((inst.projector_colour, inst.ring.colour, inst.ambient)):
+        colours = np.empty((len(lamps) + 2, n))
+        for j, light in enumerate((*lamps, inst.ring.colour, inst.ambient)):
             colours[j] = fall * (albedo * self._response(cam, light, pixel)).sum(1)
         return _Surface(hits, colours, alpha, f0, scatter, shiny)
 
@@ -289,26 +314,28 @@ class Renderer:
             return np.broadcast_to(M[0], (len(pixel), 3))
         return np.asarray(M[(pixel % cam.lens.width) % 2 + (pixel // cam.lens.width) % 2])
 
-    def _shade(self, cam: Camera, origin: F64, d: F64, pixel: AnyArray) -> _Rays:
+    def _shade(self, cam: Camera, origin: F64, d: F64, pixel: AnyArray, lamps: _Lights) -> _Rays:
         """Traces rays along `d` (n, 3) that belong to `pixel` (n,)."""
         inst, p = self.instrument, self.instrument.rig.projector
-        surface = self._surface(cam, trace(self.scene.shapes, origin, d), d, pixel)
+        surface = self._surface(cam, trace(self.scene.shapes, origin, d), d, pixel, lamps)
         hits = surface.hits
         uvz, light = self._to_projector(hits)
-        gain, sigma = np.zeros(len(d)), np.full(len(d), inst.projector.blur_units)
+        gain, sigma = np.zeros((len(d), len(lamps))), np.full(len(d), inst.projector.blur_units)
         k = np.flatnonzero(light)
-        tint = self._response(cam, inst.projector_colour, pixel[k]).sum(1)
         value = np.empty(len(k))
-        loops.reflect(
-            hits.point[k], hits.normal[k], surface.shiny[k], d[k], self._centre, p.pose.R[2], inst.projector.focus_mm,
-            inst.projector.falloff, surface.alpha[k], surface.f0[k], surface.colours[0, k], tint, 0.01, value,
-        )  # fmt: skip
-        gain[k] = value
+        for j, lamp in enumerate(lamps):
+            tint = self._response(cam, lamp, pixel[k]).sum(1)
+            loops.reflect(
+                hits.point[k], hits.normal[k], surface.shiny[k], d[k], self._centre, p.pose.R[2],
+                inst.projector.focus_mm, inst.projector.falloff, surface.alpha[k], surface.f0[k],
+                surface.colours[j, k], tint, 0.01, value,
+            )  # fmt: skip
+            gain[k, j] = value
         to = self._centre - hits.point[k]
         cos = np.einsum("ij,ij->i", to, hits.normal[k]) / np.linalg.norm(to, axis=1)
         sigma[k] = self._blur(uvz[k, 2], surface.scatter[k] * np.sqrt(np.clip(cos, 0, 1)))
-        mirrored = self._mirror(cam, surface, d, pixel) if self._mirrors else _EMPTY
-        return _Rays(surface, uvz[:, :2], light, sigma, gain, surface.colours[2], mirrored)
+        mirrored = self._mirror(cam, surface, d, pixel, lamps) if self._mirrors else _nothing(len(lamps))
+        return _Rays(surface, uvz[:, :2], light, sigma, gain, surface.colours[-1], mirrored)
 
     def _blur(self, depth: F64, spread_mm: F64) -> F64:
         """Standard deviation in plane units (along v) of projector light at `depth`, walked `spread_mm` sideways."""
@@ -316,7 +343,7 @@ class Renderer:
         defocus = optics.defocus_sigma(f, o.aperture_mm, o.focus_mm, depth)
         return np.asarray(np.sqrt(o.blur_units**2 + defocus**2 + (spread_mm * f / depth) ** 2))
 
-    def _mirror(self, cam: Camera, surface: _Surface, d: F64, pixel: AnyArray) -> _Sparse:
+    def _mirror(self, cam: Camera, surface: _Surface, d: F64, pixel: AnyArray, lamps: _Lights) -> _Sparse:
         """Fringes that a wet surface mirrors into the camera from what lies around it (the paper's case 2).
 
         Facets of roughness alpha have slopes of variance alpha^2 / 2 each way (Walter et al. 2007), which turn what is
@@ -327,23 +354,24 @@ class Renderer:
         out = d + 2 * ne[:, None] * surface.shiny
         k = np.flatnonzero((surface.f0 > 0) & (ne > 0) & (np.einsum("ij,ij->i", out, hits.normal) > 0.02))
         if not k.size:
-            return _EMPTY
+            return _nothing(len(lamps))
         second = trace(self.scene.shapes, hits.point[k] + 0.02 * hits.normal[k] + 0.01 * out[k], out[k])
         near = np.flatnonzero((second.shape >= 0) & (second.t < MIRROR_REACH))
         k = k[near]
         second = Hits(*(a[near] for a in (second.shape, second.t, second.point, second.normal)))
         uvz, light = self._to_projector(second)
-        where = self._surface(cam, second, d[k], pixel[k])
-        value, none = np.empty(len(k)), np.zeros(len(k))
-        loops.reflect(
-            second.point, second.normal, where.shiny, out[k], self._centre, inst.rig.projector.pose.R[2],
-            inst.projector.focus_mm, inst.projector.falloff, where.alpha, none, where.colours[0], none, 0.01, value,
-        )  # fmt: skip
-        value *= optics.fresnel(surface.f0[k], ne[k]) * light
-        keep = np.flatnonzero(value > MIRROR_MIN)
+        where = self._surface(cam, second, d[k], pixel[k], lamps)
+        gain, value, none = np.empty((len(k), len(lamps))), np.empty(len(k)), np.zeros(len(k))
+        for j in range(len(lamps)):
+            loops.reflect(
+                second.point, second.normal, where.shiny, out[k], self._centre, inst.rig.projector.pose.R[2],
+                inst.projector.focus_mm, inst.projector.falloff, where.alpha, none, where.colours[j], none, 0.01, value,
+            )  # fmt: skip
+            gain[:, j] = value * optics.fresnel(surface.f0[k], ne[k]) * light
+        keep = np.flatnonzero(gain[:, 0] > MIRROR_MIN)
         rough = surface.alpha[k[keep]] * np.sqrt(1 + ne[k[keep]] ** 2)
         sigma = self._blur(uvz[keep, 2], rough * second.t[keep])
-        return _Sparse(pixel[k[keep]], *(a.astype(np.float32) for a in (*uvz[keep, :2].T, sigma, value[keep])))
+        return _Sparse(pixel[k[keep]], *(a.astype(np.float32) for a in (*uvz[keep, :2].T, sigma, gain[keep])))
 
     def _lamps(self) -> F64:
         r = self.instrument.ring
@@ -368,18 +396,18 @@ class Renderer:
     def _ring(self, cam: Camera, surface: _Surface, d: F64, seen: Bool, pixel: AnyArray) -> F64:
         """Ring-light signal (n,)."""
         r, hits = self.instrument.ring, surface.hits
-        tint = self._response(cam, r.colour, pixel).sum(1)
-        total, value = np.zeros(len(d)), np.empty(len(d))
+        tint, total, value = self._response(cam, r.colour, pixel).sum(1), np.zeros(len(d)), np.empty(len(d))
         for lamp, reaches in zip(self._lamps(), seen, strict=True):
             loops.reflect(
                 hits.point, hits.normal, surface.shiny, d, lamp, np.zeros(3), r.height, 0.0,
-                surface.alpha, surface.f0, surface.colours[1], tint, r.softness, value,
+                surface.alpha, surface.f0, surface.colours[-2], tint, r.softness, value,
             )  # fmt: skip
             total += reaches * value
         return r.brightness / r.lamps * np.where(hits.shape >= 0, total, 0.0)
 
 
-_EMPTY = _Sparse(np.empty(0, np.intp), *(np.empty(0, np.float32) for _ in range(4)))
+def _nothing(lamps: int) -> _Sparse:
+    return _Sparse(np.empty(0, np.intp), *(np.empty(s, np.float32) for s in (0, 0, 0, (0, lamps))))
 
 
 def _pixels(cam: Camera, index: AnyArray) -> F64:
