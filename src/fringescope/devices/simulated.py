@@ -17,7 +17,7 @@ import numpy as np
 from fringescope.devices import base, virtual
 from fringescope.errors import DeviceLostError, DeviceTimeoutError, UsageError
 from fringescope.twin import presets, render, scene
-from fringescope.types import U8, AnyArray, PixelFormat, Rig
+from fringescope.types import U8, AnyArray, Layout, PixelFormat, Rig
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class _Edge:
 class World:
     """What simulated devices share: scene, clock, trigger line, lights, faults, and the seed of all noise.
 
-    `noise` off makes every sensor exact but for rounding. The renderer keeps geometry for each camera.
+    `noise` off makes every sensor exact but for rounding. The renderer keeps geometry for each camera. `uri`: what
+    opens the same instrument over the same scene once more, with other noise, where that can be said.
     """
 
     def __init__(
@@ -64,9 +65,10 @@ class World:
         noise: bool = True,
         faults: Faults | None = None,
         rays: int | None = None,
+        uri: str | None = None,
     ) -> None:
         self.scene, self.instrument, self.seed, self.noise = view, instrument, seed, noise
-        self.faults = faults or Faults()
+        self.faults, self.uri = faults or Faults(), uri
         self.renderer = render.Renderer(view, instrument, rays)
         self.ring = 0.0
         self.line: virtual.TriggerLine[_Edge] = virtual.TriggerLine()
@@ -218,10 +220,11 @@ class SimulatedLight(virtual.VirtualLight):
 
 
 def parse(uri: str) -> World:
-    """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4`; a fragment is
-    ignored.
+    """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4&layout=grid`; a
+    fragment is ignored.
 
-    Raises UsageError for a name or option that there is not.
+    `noise`: 0 none, else which draw of it; 1 is that of `fringescope simulate`. Raises UsageError for a name or option
+    that there is not.
     """
     u = urllib.parse.urlsplit(uri)
     name = u.path.strip("/")
@@ -233,6 +236,7 @@ def parse(uri: str) -> World:
         "board": "checkerboard",
         "noise": 1,
         "rays": 0,
+        "layout": "diamond",
     }
     options = dict(known)
     for key, text in urllib.parse.parse_qsl(u.query, keep_blank_values=True):
@@ -244,9 +248,15 @@ def parse(uri: str) -> World:
             raise UsageError(f"{uri}: {key}={text}; needed a number") from e
     if u.scheme != "sim" or not u.netloc or not name:
         raise UsageError(f"{uri}: needed sim://PRESET/SCENE, for example sim://paper/tissue-domed?scale=0.125")
-    instrument = presets.instrument(u.netloc, float(options["scale"]))
-    view = scene.make(name, int(options["seed"]), float(options["lift"]), int(options["pose"]), str(options["board"]))
-    return World(view, instrument, int(options["seed"]), bool(options["noise"]), rays=int(options["rays"]) or None)
+    if options["layout"] not in ("grid", "diamond"):
+        raise UsageError(f"{uri}: layout={options['layout']}; needed grid or diamond")
+    instrument = presets.instrument(u.netloc, float(options["scale"]), Layout(options["layout"]))
+    seed, draw = int(options["seed"]), int(options["noise"])
+    if min(seed, draw, int(options["pose"])) < 0:
+        raise UsageError(f"{uri}: seed, noise and pose count from 0")
+    view = scene.make(name, seed, float(options["lift"]), int(options["pose"]), str(options["board"]))
+    noise_seed = seed + 1_000_000_007 * max(draw - 1, 0)
+    return World(view, instrument, noise_seed, draw > 0, rays=int(options["rays"]) or None)
 
 
 @dataclass(frozen=True, eq=False)
