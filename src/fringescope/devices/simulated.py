@@ -16,7 +16,7 @@ import numpy as np
 
 from fringescope.devices import base, virtual
 from fringescope.errors import DeviceLostError, DeviceTimeoutError, UsageError
-from fringescope.twin import presets, render, scene
+from fringescope.twin import changes, presets, render, scene
 from fringescope.types import U8, AnyArray, Layout, PixelFormat, Rig
 
 
@@ -69,12 +69,19 @@ class World:
     ) -> None:
         self.scene, self.instrument, self.seed, self.noise = view, instrument, seed, noise
         self.faults, self.uri = faults or Faults(), uri
+        self._rays = rays
         self.renderer = render.Renderer(view, instrument, rays)
         self.ring = 0.0
         self.line: virtual.TriggerLine[_Edge] = virtual.TriggerLine()
         self._clock_ns = 1_000_000_000
         self._lock = threading.Lock()
         self._render_lock = threading.Lock()
+
+    def change(self, view: scene.Scene) -> None:
+        """Another scene lies under the instrument from now on: frames exposed later show it. Devices stay open."""
+        made = render.Renderer(view, self.instrument, self._rays)
+        with self._render_lock:
+            self.scene, self.renderer = view, made
 
     def advance(self, ns: int) -> int:
         """Moves the clock on; returns the time before, ns."""
@@ -221,7 +228,8 @@ class SimulatedLight(virtual.VirtualLight):
 
 def parse(uri: str) -> World:
     """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4&layout=grid`; a
-    fragment is ignored.
+    fragment is ignored. `move=0.3,0,0&turn=0,0,0.5&dent=0.5&dry=0.3&ring=0.9&cover=10`: what befell the scene since it
+    was scanned, see `twin.changes.changed`.
 
     `noise`: 0 none, else which draw of it; 1 is that of `fringescope simulate`. Raises UsageError for a name or option
     that there is not.
@@ -237,6 +245,7 @@ def parse(uri: str) -> World:
         "noise": 1,
         "rays": 0,
         "layout": "diamond",
+        **dict.fromkeys(changes.OPTIONS, ""),
     }
     options = dict(known)
     for key, text in urllib.parse.parse_qsl(u.query, keep_blank_values=True):
@@ -255,6 +264,7 @@ def parse(uri: str) -> World:
     if min(seed, draw, int(options["pose"])) < 0:
         raise UsageError(f"{uri}: seed, noise and pose count from 0")
     view = scene.make(name, seed, float(options["lift"]), int(options["pose"]), str(options["board"]))
+    view = changes.changed(view, {k: str(options[k]) for k in changes.OPTIONS})
     noise_seed = seed + 1_000_000_007 * max(draw - 1, 0)
     return World(view, instrument, noise_seed, draw > 0, rays=int(options["rays"]) or None)
 
