@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -15,11 +16,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from fringescope import export, geometry, store
+from fringescope import export, geometry, pipeline, store
+from fringescope.capture import photograph
 from fringescope.cli import run
 from fringescope.cli.capturing import make_world
 from fringescope.cli.common import Progress, load_settings
 from fringescope.cli.showing import errors
+from fringescope.devices import registry
 from fringescope.errors import UsageError
 from fringescope.settings import from_yaml, to_dict
 from fringescope.types import Cloud, Grid, Scan
@@ -96,6 +99,33 @@ def test_reconstruct_leaves_a_scan_on_the_true_plane(simulated: Path, scan: Path
     assert (scan / "view.html").is_file()
     glb = (scan / "surface.glb").read_bytes()
     assert back.document["hash"].encode() in glb
+
+
+def test_a_scan_keeps_its_pictures_and_the_instrument_that_took_it(simulated: Path, scan: Path) -> None:
+    """And that URI opens the same instrument over the same scene, seen with other noise."""
+    capture, back = store.read_capture(simulated), store.read_scan(scan)
+    assert back.instrument == "sim://pair/plane?scale=0.04&seed=0&layout=diamond&noise=2"
+    again = registry.open_station(back.instrument)
+    with again:
+        assert again.light is not None
+        live = photograph(again.projector, again.cameras, again.light)
+    for view, picture, frame in zip(store.view_inputs(capture), back.every_picture(), live, strict=True):
+        assert (picture.pixel_format, picture.light) == (view.plan.pixel_format, "ring")
+        assert view.color is not None
+        np.testing.assert_array_equal(picture.frame, view.color)
+        off = frame.astype(float) - picture.frame
+        assert 0.1 < np.abs(off).mean() < 2.0  # other noise and nothing else
+        assert abs(off.mean()) < 0.05
+
+
+def test_the_background_serves_where_there_is_no_picture(simulated: Path) -> None:
+    rig = store.read_rig(simulated / "truth" / "rig.json")
+    views = [dataclasses.replace(v, color=None) for v in store.view_inputs(store.read_capture(simulated))]
+    made = pipeline.scan(views, rig, surface=False)
+    for view, picture in zip(views, made.pictures, strict=True):
+        assert (picture.light, picture.pixel_format) == ("projector", view.plan.pixel_format)
+        finest = [f.astype(float) for key, f in view.frames if key.set_index == len(view.plan.sets) - 1]
+        np.testing.assert_allclose(picture.frame, np.mean(finest, axis=0), atol=0.51)
 
 
 def test_a_scan_tells_its_times_once(scan: Path) -> None:

@@ -35,6 +35,7 @@ from fringescope.types import (
     Layout,
     Lens,
     NoiseModel,
+    Picture,
     PixelFormat,
     Reason,
     Role,
@@ -403,7 +404,7 @@ def a_scan() -> Scan:
     return Scan(tuple(grids), cloud, None, (verdict,), {"rms": np.float32(1.5), "bad": float("nan")})
 
 
-def write_a_scan(folder: Path, **more: Any) -> dict[str, Any]:
+def write_a_scan(folder: Path, pictures: tuple[Picture, ...] = (), **more: Any) -> dict[str, Any]:
     def ply(cloud: Cloud, path: Path) -> None:
         path.write_bytes(b"ply" + cloud.xyz.tobytes())
 
@@ -412,7 +413,7 @@ def write_a_scan(folder: Path, **more: Any) -> dict[str, Any]:
 
     return store.write_scan(
         folder,
-        a_scan(),
+        dataclasses.replace(a_scan(), pictures=pictures),
         settings={"phase": {"x": 1}},
         capture_hash="sha256:1",
         rig_hash="sha256:2",
@@ -462,6 +463,53 @@ def test_scan_comes_back(tmp_path: Path, grids: bool) -> None:
         assert tifffile.imread(tmp_path / "s/camera2/xyz.tif").shape == (6, 9, 3)
     sha = hashlib.sha256((tmp_path / "s/cloud.ply").read_bytes()).hexdigest()
     assert doc["files"]["cloud.ply"] == f"sha256:{sha}"
+
+
+@pytest.mark.parametrize("grids", [True, False])
+def test_the_pictures_of_a_scan_come_back(tmp_path: Path, grids: bool) -> None:
+    rng = np.random.default_rng(4)
+    mosaic = Picture("camera1", rng.integers(0, 4096, (6, 9), np.uint16), PixelFormat.BAYER_RG12)
+    colour = Picture("camera2", rng.integers(0, 256, (6, 9, 3), np.uint8), PixelFormat.RGB8, "projector")
+    doc = write_a_scan(tmp_path / "s", (mosaic, colour), grids=grids, extra={"instrument": "sim://pair/plane"})
+    file = "camera1/picture." + ("png" if grids else "npy")
+    assert doc["views"][0]["picture"] == {"file": file, "pixel_format": "BayerRG12", "light": "ring"}
+    assert file in doc["files"]
+    back = store.read_scan(tmp_path / "s")
+    assert back.instrument == "sim://pair/plane"
+    for a, b in zip(back.every_picture(), (mosaic, colour), strict=True):
+        assert (a.camera, a.pixel_format, a.light, a.frame.dtype) == (b.camera, b.pixel_format, b.light, b.frame.dtype)
+        np.testing.assert_array_equal(a.frame, b.frame)
+
+
+@pytest.mark.parametrize(
+    ("told", "why"),
+    [
+        ({"file": "camera1/picture.npy", "pixel_format": "Mono9", "light": "ring"}, "needed file, pixel_format"),
+        ({"file": "camera1/picture.npy", "pixel_format": "Mono12", "light": "ring"}, "missing or broken"),
+        ({"file": "camera1/none.npy", "pixel_format": "Mono8", "light": "ring"}, "missing or broken"),
+        ({"file": "../picture.npy", "pixel_format": "Mono8", "light": "ring"}, "picture"),
+        ({"file": "camera1/picture.npy", "pixel_format": "Mono8", "light": "moon"}, "needed ring or projector"),
+        ({"file": "camera1/xyz.npy", "pixel_format": "Mono8", "light": "ring"}, "needs"),
+        ([1], "needed file"),
+    ],
+)
+def test_pictures_that_are_not_what_scan_json_says(tmp_path: Path, told: Any, why: str) -> None:
+    write_a_scan(tmp_path / "s", (Picture("camera1", np.ones((6, 9), np.uint8), PixelFormat.MONO8),))
+    doc = json.loads((tmp_path / "s/scan.json").read_text())
+    doc["views"][0]["picture"] = told
+    (tmp_path / "s/scan.json").write_text(json.dumps(doc))
+    with pytest.raises(FormatError, match=why):
+        store.read_scan(tmp_path / "s")
+
+
+def test_a_scan_without_pictures_says_to_reconstruct_again(tmp_path: Path) -> None:
+    write_a_scan(tmp_path / "s")
+    back = store.read_scan(tmp_path / "s")
+    assert back.pictures == (None, None)
+    assert back.instrument is None
+    with pytest.raises(FormatError, match="no picture of camera1, camera2; reconstruct it again"):
+        back.every_picture()
+    assert store.read_scan(tmp_path / "s", grids=False).pictures == ()
 
 
 def test_times_of_a_scan_stand_beside_its_figures(tmp_path: Path) -> None:

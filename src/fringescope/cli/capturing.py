@@ -61,7 +61,8 @@ def simulate_into(folder: Path, world: World, plan: PatternPlan, s: Settings, pr
                 frames = capture.stream(station.projector, camera, shown, view, s.capture)
                 yield ViewInput(view, progress.track(frames, f"capture {view.camera}", len(view.keys)), photo)
 
-        store.put_capture(folder, p.width, p.height, p.layout, views())
+        extra = {"instrument": world.uri} if world.uri else None
+        store.put_capture(folder, p.width, p.height, p.layout, views(), extra)
     truth.write(world.scene, rig, folder / "truth")
 
 
@@ -98,7 +99,10 @@ def make_world(scene: str, preset: str, scale: float, seed: int, layout: str, po
         raise UsageError(f"--layout {layout}; needed grid or diamond")
     instrument = presets.instrument(preset, scale, Layout(layout))
     noise_seed = seed + 1_000_003 * pose  # the poses of a session share no noise
-    return simulated.World(scenes.make(scene, seed, pose=pose, board=board), instrument, noise_seed)
+    options = {"scale": scale, "seed": seed, "layout": layout, "noise": 2}
+    options |= {"pose": pose, "board": board} if scene == "board" else {}
+    uri = f"sim://{preset}/{scene}?" + "&".join(f"{k}={v}" for k, v in options.items())
+    return simulated.World(scenes.make(scene, seed, pose=pose, board=board), instrument, noise_seed, uri=uri)
 
 
 def make_plan(world: World, s: Settings) -> PatternPlan:

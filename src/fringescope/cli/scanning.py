@@ -89,6 +89,7 @@ def scan_into(
             write_glb=export.write_glb,
             write_preview=export.write_preview,
             grids=grids,
+            extra={"instrument": c.extra["instrument"]} if isinstance(c.extra.get("instrument"), str) else None,
         ),
     )
     return scan, doc

@@ -17,8 +17,8 @@ import numpy as np
 
 from fringescope.devices import base, virtual
 from fringescope.errors import DeviceLostError, DeviceTimeoutError, UsageError
-from fringescope.twin import presets, render, scene
-from fringescope.types import AnyArray, PixelFormat, Rig
+from fringescope.twin import changes, presets, render, scene
+from fringescope.types import AnyArray, Layout, PixelFormat, Rig
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class _Edge:
 class World:
     """What simulated devices share: scene, clock, trigger line, lights, faults, and the seed of all noise.
 
-    `noise` off makes every sensor exact but for rounding. The renderer keeps geometry for each camera.
+    `noise` off makes every sensor exact but for rounding. The renderer keeps geometry for each camera. `uri`: what
+    opens the same instrument over the same scene once more, with other noise, where that can be said.
     """
 
     def __init__(
@@ -64,9 +65,11 @@ class World:
         noise: bool = True,
         faults: Faults | None = None,
         rays: int | None = None,
+        uri: str | None = None,
     ) -> None:
         self.scene, self.instrument, self.seed, self.noise = view, instrument, seed, noise
-        self.faults = faults or Faults()
+        self.faults, self.uri = faults or Faults(), uri
+        self._rays = rays
         self.renderer = render.Renderer(view, instrument, rays)
         self.ring = 0.0
         self.projector: base.Projector | None = None  #: whose light falls on the scene
@@ -74,6 +77,12 @@ class World:
         self._clock_ns = 1_000_000_000
         self._lock = threading.Lock()
         self._render_lock = threading.Lock()
+
+    def change(self, view: scene.Scene) -> None:
+        """Another scene lies under the instrument from now on: frames exposed later show it. Devices stay open."""
+        made = render.Renderer(view, self.instrument, self._rays)
+        with self._render_lock:
+            self.scene, self.renderer = view, made
 
     def advance(self, ns: int) -> int:
         """Moves the clock on; returns the time before, ns."""
@@ -215,10 +224,12 @@ class SimulatedLight(virtual.VirtualLight):
 
 
 def parse(uri: str) -> World:
-    """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4`; a fragment is
-    ignored.
+    """The world of `sim://PRESET/SCENE?scale=0.125&seed=1&lift=0&pose=0&board=charuco&noise=0&rays=4&layout=grid`; a
+    fragment is ignored. `move=0.3,0,0&turn=0,0,0.5&dent=0.5&dry=0.3&ring=0.9&cover=10`: what befell the scene since it
+    was scanned, see `twin.changes.changed`.
 
-    Raises UsageError for a name or option that there is not.
+    `noise`: 0 none, else which draw of it; 1 is that of `fringescope simulate`. Raises UsageError for a name or option
+    that there is not.
     """
     u = urllib.parse.urlsplit(uri)
     name = u.path.strip("/")
@@ -230,6 +241,8 @@ def parse(uri: str) -> World:
         "board": "checkerboard",
         "noise": 1,
         "rays": 0,
+        "layout": "diamond",
+        **dict.fromkeys(changes.OPTIONS, ""),
     }
     options = dict(known)
     for key, text in urllib.parse.parse_qsl(u.query, keep_blank_values=True):
@@ -241,9 +254,16 @@ def parse(uri: str) -> World:
             raise UsageError(f"{uri}: {key}={text}; needed a number") from e
     if u.scheme != "sim" or not u.netloc or not name:
         raise UsageError(f"{uri}: needed sim://PRESET/SCENE, for example sim://paper/tissue-domed?scale=0.125")
-    instrument = presets.instrument(u.netloc, float(options["scale"]))
-    view = scene.make(name, int(options["seed"]), float(options["lift"]), int(options["pose"]), str(options["board"]))
-    return World(view, instrument, int(options["seed"]), bool(options["noise"]), rays=int(options["rays"]) or None)
+    if options["layout"] not in ("grid", "diamond"):
+        raise UsageError(f"{uri}: layout={options['layout']}; needed grid or diamond")
+    instrument = presets.instrument(u.netloc, float(options["scale"]), Layout(options["layout"]))
+    seed, draw = int(options["seed"]), int(options["noise"])
+    if min(seed, draw, int(options["pose"])) < 0:
+        raise UsageError(f"{uri}: seed, noise and pose count from 0")
+    view = scene.make(name, seed, float(options["lift"]), int(options["pose"]), str(options["board"]))
+    view = changes.changed(view, {k: str(options[k]) for k in changes.OPTIONS})
+    noise_seed = seed + 1_000_000_007 * max(draw - 1, 0)
+    return World(view, instrument, noise_seed, draw > 0, rays=int(options["rays"]) or None)
 
 
 @dataclass(frozen=True, eq=False)

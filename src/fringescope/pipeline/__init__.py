@@ -16,7 +16,7 @@ import numpy as np
 
 from fringescope import denoise, fuse, geometry, phase, response, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
-from fringescope.pipeline import arrival, coarse, fast
+from fringescope.pipeline import arrival, coarse, fast, pictures
 from fringescope.pipeline.fast import Device
 from fringescope.settings import Settings
 from fringescope.threads import WORKERS
@@ -33,6 +33,7 @@ from fringescope.types import (
     Grid,
     NoiseModel,
     Photo,
+    Picture,
     Rig,
     RowFrames,
     Scan,
@@ -380,6 +381,7 @@ def scan(
     times: dict[str, float] = {}
     grids: list[Grid] = []
     photos: list[Photo] = []
+    taken: list[Picture] = []
     notes: dict[str, tuple[str, ...]] = {}
     figures: dict[str, Any] = {"views": {}}
     early = _Coarse(rig, s)
@@ -387,7 +389,7 @@ def scan(
         tell("coarse surface", 0.0)
         _show_early(early, [view for view in views if arrival.is_here(view)], len(views), first)
 
-    def one(view: ViewInput) -> tuple[Decoded, Grid, Photo, float]:
+    def one(view: ViewInput) -> tuple[Decoded, Grid, Photo, Picture, float]:
         geometry.check_baseline(rig, rig.camera(view.plan.camera))
         come, begun = arrival.gathered(view, rig, s)
         if first is not None and not arrival.is_here(view):
@@ -395,14 +397,15 @@ def scan(
             _show_early(early, [come], len(views), first)
         start = perf_counter()
         decoded, grid = _scanned(come, begun, rig, s, device)
-        return decoded, grid, picture(come, decoded, s), perf_counter() - start
+        return decoded, grid, picture(come, decoded, s), pictures.taken(come, decoded), perf_counter() - start
 
     with arrival.each(one, views, rig, at_once=device == "cpu" and first is None) as made:
         for n, view in enumerate(views):
             tell(f"decoding {view.plan.camera}", 0.7 * n / len(views))
-            decoded, grid, photo, took = next(made)
+            decoded, grid, photo, raw, took = next(made)
             grids.append(grid)
             photos.append(photo)
+            taken.append(raw)
             times[f"scan_view {grid.camera}"] = took
             figures["views"][grid.camera] = _figures(view, decoded, grid)
             figures["views"][grid.camera]["interpolated"] = denoise.interpolated(decoded, view.plan.pixel_format)
@@ -410,7 +413,7 @@ def scan(
     if first is not None:
         times["preview"] = early.seconds
     order = np.argsort([g.view for g in grids])
-    grids, photos = [grids[i] for i in order], [photos[i] for i in order]
+    grids, photos, taken = ([a[i] for i in order] for a in (grids, photos, taken))
     tell("comparing the views", 0.7)
     start = perf_counter()
     grids = list(denoise.agree(grids, rig, s.denoise, in_place=True))
@@ -437,7 +440,7 @@ def scan(
     tell("done", 1.0)
     figures["times_s"] = times
     fine, small = (levels[0], levels[-1]) if levels else (None, None)
-    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, small, every)
+    return Scan(tuple(grids), cloud, fine, tuple(verdicts), figures, small, every, tuple(taken))
 
 
 def _show_early(early: _Coarse, views: Sequence[ViewInput], count: int, show: Callable[[Surface], None]) -> None:

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from fringescope import __version__
-from fringescope.errors import FormatError
+from fringescope.errors import CaptureError, FormatError
 from fringescope.store import files
 from fringescope.store.images import Images, write_png, write_tiff
-from fringescope.types import F32, U8, U16, Cloud, Decoded, Grid, Reason, Scan, Surface
+from fringescope.types import F32, U8, U16, Cloud, Decoded, Grid, Picture, PixelFormat, Reason, Scan, Surface
 
 FORMAT, VERSION = "fringescope-scan", 1
 DECODED_FORMAT, DECODED_VERSION = "fringescope-decoded", 1
@@ -34,11 +34,14 @@ WriteGlb = Callable[[Surface, Path, Mapping[str, Any]], None]
 
 @dataclass(frozen=True, eq=False)
 class StoredScan:
-    """A scan read back: its folder, scan.json, and the grids of its views."""
+    """A scan read back: its folder, scan.json, the grids of its views, and the photograph of each: None where the scan
+    was made before scans kept them.
+    """
 
     folder: Path
     document: Mapping[str, Any]
     grids: tuple[Grid, ...]
+    pictures: tuple[Picture | None, ...] = ()
 
     @property
     def cloud(self) -> Path:
@@ -50,6 +53,19 @@ class StoredScan:
         """Its surface.glb, where it has one."""
         path = self.folder / "surface.glb"
         return path if path.is_file() else None
+
+    @property
+    def instrument(self) -> str | None:
+        """The URI of the instrument that took it, where the scan tells it."""
+        told = self.document.get("instrument")
+        return told if isinstance(told, str) else None
+
+    def every_picture(self) -> tuple[Picture, ...]:
+        """The photograph of each grid. Raises FormatError where the scan keeps none."""
+        without = [g.camera for g, p in zip(self.grids, self.pictures, strict=True) if p is None]
+        if without:
+            raise FormatError(f"{self.folder}: the scan keeps no picture of {', '.join(without)}; reconstruct it again")
+        return tuple(p for p in self.pictures if p is not None)
 
 
 def plain(value: Any) -> Any:
@@ -99,14 +115,16 @@ def put_scan(
     """Writes a scan into an existing folder and returns its scan.json.
 
     `scan.all_points`, where there is one, takes the place of the fused cloud in cloud.ply. `grids` writes the organised
-    grids as TIFF and PNG, else as .npy. `write_preview` writes the small level, preview.glb. `extra` adds keys to
-    scan.json; `scan.figures["times_s"]` stands beside its "figures". "hash" identifies the scan: sha256 over the hashes
-    of capture and rig, settings, program version and cloud.ply; the GLB carries it in `asset.extras`.
+    grids as TIFF and PNG and the pictures as PNG, else as .npy. `write_preview` writes the small level, preview.glb.
+    `extra` adds keys to scan.json; `scan.figures["times_s"]` stands beside its "figures". "hash" identifies the scan:
+    sha256 over the hashes of capture and rig, settings, program version and cloud.ply; the GLB carries it in
+    `asset.extras`.
     """
     cloud = scan.cloud if scan.all_points is None else scan.all_points
     preview = scan.preview if write_preview else None
     with ThreadPoolExecutor(WRITERS) as pool:
         tasks = [pool.submit(_put_grid, folder / g.camera, g, grids) for g in scan.grids]
+        tasks += [pool.submit(_put_picture, folder / p.camera, p, grids) for p in scan.pictures]
         write_ply(cloud, folder / "cloud.ply")
         identity = {
             "capture": capture_hash,
@@ -127,6 +145,14 @@ def put_scan(
         names = [str(p.relative_to(folder).as_posix()) for p in written]
         digests = dict(zip(names, pool.map(_sha256, written), strict=True))
     verdicts = {v.camera: plain(v) for v in scan.verdicts}
+    photos = {
+        p.camera: {
+            "file": f"{p.camera}/picture.{'png' if grids else 'npy'}",
+            "pixel_format": p.pixel_format.value,
+            "light": p.light,
+        }
+        for p in scan.pictures
+    }
     doc = {
         "format": FORMAT,
         "version": VERSION,
@@ -149,7 +175,13 @@ def put_scan(
         else {"vertices": len(preview.vertices), "triangles": preview.n_faces},
         "grids": "tif" if grids else "npy",
         "views": [
-            {"view": g.view, "camera": g.camera, "size": list(g.reasons.shape[::-1]), **verdicts.get(g.camera, {})}
+            {
+                "view": g.view,
+                "camera": g.camera,
+                "size": list(g.reasons.shape[::-1]),
+                **verdicts.get(g.camera, {}),
+                "picture": photos.get(g.camera),
+            }
             for g in scan.grids
         ],
         "filters": plain(scan.figures.get("filters", [])),
@@ -175,6 +207,15 @@ def _put_grid(folder: Path, g: Grid, tif: bool) -> None:
     for name, a in (("xyz", xyz), ("sigma", sigma), ("reasons", reasons)):
         with (folder / f"{name}.npy").open("wb") as f:
             np.save(f, a)
+
+
+def _put_picture(folder: Path, p: Picture, png: bool) -> None:
+    folder.mkdir(exist_ok=True)
+    if png:
+        write_png(folder / "picture.png", p.frame)
+        return
+    with (folder / "picture.npy").open("wb") as f:
+        np.save(f, p.frame)
 
 
 def write_scan(folder: Path | str, scan: Scan, *, force: bool = False, **how: Any) -> dict[str, Any]:
@@ -207,7 +248,8 @@ def read_scan(folder: Path | str, *, grids: bool = True, check: bool = True) -> 
         if check and _sha256(folder / name) != digest:
             raise FormatError(f"{folder / name}: changed since the scan was written; reconstruct it again")
     out = [_read_grid(folder, entry, doc.get("grids") == "tif", path) for entry in doc["views"]] if grids else []
-    return StoredScan(folder, doc, tuple(out))
+    pictures = [_read_picture(folder, entry, g, path) for entry, g in zip(doc["views"], out, strict=bool(out))]
+    return StoredScan(folder, doc, tuple(out), tuple(pictures))
 
 
 def _read_grid(folder: Path, entry: Any, tif: bool, path: Path) -> Grid:
@@ -229,6 +271,28 @@ def _read_grid(folder: Path, entry: Any, tif: bool, path: Path) -> Grid:
     if xyz.shape != (h, w, 3) or sigma.shape != (h, w) or xyz.dtype != np.float32 or reasons.dtype != np.uint16:
         raise FormatError(f"{sub}: grids of shapes {xyz.shape}, {sigma.shape}, {reasons.shape}; needed one size")
     return Grid(entry["view"], camera, xyz, sigma, reasons)
+
+
+def _read_picture(folder: Path, entry: Mapping[str, Any], g: Grid, path: Path) -> Picture | None:
+    told = entry.get("picture")
+    if told is None:
+        return None
+    names = [told.get(k) for k in ("file", "pixel_format", "light")] if isinstance(told, dict) else []
+    formats = {f.value: f for f in PixelFormat}
+    if len(names) != 3 or not all(isinstance(n, str) for n in names) or names[1] not in formats:
+        raise FormatError(f"{path}: views: picture {files.shown(told)}; needed file, pixel_format and light")
+    file, fmt, light = str(names[0]), formats[names[1]], str(names[2])
+    if bad := files.check_relative(file):
+        raise FormatError(f"{path}: views: picture {files.shown(file)}: {bad}")
+    try:
+        png = file.endswith(".png")
+        frame = Images(folder).frame(file, fmt) if png else np.load(folder / file, allow_pickle=False)
+        picture = Picture(g.camera, frame, fmt, light)
+    except (OSError, ValueError, EOFError, CaptureError) as e:
+        raise FormatError(f"{folder / file}: picture missing or broken: {str(e).splitlines()[0][:160]}") from e
+    if frame.shape[:2] != g.reasons.shape:
+        raise FormatError(f"{folder / file}: a picture of {frame.shape[:2]}; its grid has {g.reasons.shape}")
+    return picture
 
 
 # ------------------------------------------------------------------------------------------------ a decoded capture

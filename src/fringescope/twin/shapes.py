@@ -174,12 +174,16 @@ class Boxes(_Analytic):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh in world mm: vertices (n, 3), unit normals (n, 3), faces (m, 3)."""
+    """A triangle mesh in world mm: vertices (n, 3), unit normals (n, 3), faces (m, 3).
+
+    `pose` (T_world_own) is that of the coordinates in which its finish is defined.
+    """
 
     finish: Finish
     vertices: F64
     normals: F64
     faces: AnyArray
+    pose: Pose = IDENTITY
     _embree: list[Any] = field(default_factory=list, repr=False)
 
     def _scene(self) -> Any:
@@ -191,8 +195,8 @@ class Mesh:
         return self._embree[0]
 
     def local(self, points: F64) -> F64:
-        """World coordinates."""
-        return points
+        """World to own coordinates."""
+        return points if self.pose is IDENTITY else np.asarray((points - self.pose.t) @ self.pose.R)
 
     def hit(self, origins: F64, directions: F64) -> tuple[F64, F64]:
         """See `Shape`. Embree finds the triangle; the distance is computed again in float64."""

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fringescope.errors import CaptureError
 from fringescope.types.capture import NoiseModel
-from fringescope.types.names import F32, U8, U16, U32, Bool
+from fringescope.types.names import F32, U8, U16, U32, AnyArray, Bool, PixelFormat
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +98,31 @@ class Photo:
 
 
 @dataclass(frozen=True, eq=False)
+class Picture:
+    """A raw photograph of one view: (H, W) codes, mono or mosaic, or (H, W, 3) for RGB8, uint8 or uint16.
+
+    `light` says what lit it: "ring", or "projector" where it is the fringes' background A, rounded to codes.
+    """
+
+    camera: str
+    frame: AnyArray
+    pixel_format: PixelFormat
+    light: str = "ring"
+
+    def __post_init__(self) -> None:
+        deep = 3 if self.pixel_format is PixelFormat.RGB8 else 2
+        if self.frame.ndim != deep or (deep == 3 and self.frame.shape[2] != 3):
+            raise CaptureError(f"camera '{self.camera}': a picture of shape {self.frame.shape}; "
+                               f"{self.pixel_format.value} needs (height, width{', 3' * (deep == 3)})")
+        if self.frame.dtype != self.pixel_format.dtype:
+            raise CaptureError(f"camera '{self.camera}': a picture of {self.frame.dtype}; {self.pixel_format.value} "
+                               f"needs {self.pixel_format.dtype}")
+        if self.light not in ("ring", "projector"):
+            raise CaptureError(f"camera '{self.camera}': a picture under the light '{self.light}'; needed ring or "
+                               "projector")
+
+
+@dataclass(frozen=True, eq=False)
 class Cloud:
     """Points in world mm: xyz (n, 3), unit normals (n, 3), sRGB colours (n, 3), sigma (n,), view (n,)."""
 
@@ -155,7 +181,7 @@ class Scan:
     """The result of the main job: one grid per view, the fused cloud, the surface, what was lost and why.
 
     `surface` is the finest level of detail, `preview` the coarsest; `all_points` every valid pixel of every view, where
-    it was asked for.
+    it was asked for. `pictures`: the photograph of each grid, the raw frame itself, not a copy.
     """
 
     grids: tuple[Grid, ...]
@@ -165,3 +191,4 @@ class Scan:
     figures: Mapping[str, Any] = field(default_factory=dict)
     preview: Surface | None = None
     all_points: Cloud | None = None
+    pictures: tuple[Picture, ...] = ()
