@@ -18,6 +18,8 @@ from fringescope.types import F64, Bool, Reason, Stroke, StrokeKind
 #: reasons of pixels that were lit all the same: their neighbours may speak for them
 LIT = int(Reason.SATURATED | Reason.JUMP | Reason.NOT_LOCAL | Reason.VIEWS_DISAGREE)
 BRIDGE_MM = 0.1  #: what is lit must be this near to a point of some camera, and its sampling, to throw a shadow
+DEEP_MM = 1.0  #: triangles that bridge a gap do not lie farther before its ground than this
+RIM_PIXELS = 2.0  #: so much of the edge of a surface, in a camera's pixels, has no points
 MARCH_MM = 0.25  #: steps along a camera's ray towards the surface of other views
 
 
@@ -235,12 +237,22 @@ def _gap(xyz: F64, uv: F64, tissue: Tissue) -> tuple[F64, F64]:
 
 
 def known_gap(xyz: F64, uv: F64, tissue: Tissue) -> tuple[F64, F64]:
-    """As `_gap`, NaN where no camera measured what seems to be lit: triangles also bridge what they should not."""
+    """As `_gap`, NaN where no camera measured what seems to be lit: triangles also bridge what they should not.
+
+    Close to the edge of a surface, where its last pixels were lost, what lies deep behind it is behind it.
+    """
     gap, slack = _gap(xyz, uv, tissue)
-    doubt = np.flatnonzero(gap > 0)
+    r = tissue.relief
+    with np.errstate(invalid="ignore"):
+        doubt = np.flatnonzero((gap > 0) & (gap < DEEP_MM))
     bridge = doubt[~tissue.supported(tissue.relief.at(uv[doubt]), slack_mm=BRIDGE_MM)]
     gap[bridge] = np.nan
-    return gap, slack
+    away = r.of(r.away, uv)
+    behind = geometry.transform(tissue.rig.projector.pose, xyz)[:, 2] - r.of(r.beside, uv)
+    with np.errstate(invalid="ignore"):
+        rim = np.isnan(gap) & (away > 0) & (away <= RIM_PIXELS * max(tissue.footprints))
+        rim &= behind > np.maximum(DEEP_MM, 4 * away)
+    return np.where(rim, behind, gap), slack
 
 
 def _beside(xyz: F64, uv: F64, tissue: Tissue, s: GuideSettings) -> Bool:
