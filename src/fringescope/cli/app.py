@@ -60,6 +60,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "scanning",
         "A scan in other people's formats: the surface (stl, obj, 3mf, glb) or the points (pcd, e57, ply), in mm.",
     ),
+    "guide": (
+        "guiding",
+        "Guidelines to the picture that the projector shows, and what of them is visible and how exact.",
+    ),
     "demo": (
         "showing",
         "The simulated instrument scans a wet specimen: capture, scan, error map against the truth, "

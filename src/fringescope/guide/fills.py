@@ -103,8 +103,8 @@ def in_photograph(pixels: F64, camera: str, tissue: Tissue) -> tuple[F32, Any] |
     at = geometry.project(device, place)
     x, y = (at - low).astype(np.float32).T
     with np.errstate(invalid="ignore"):
-        out = cv2.remap(share, np.nan_to_num(x, nan=-9)[None], np.nan_to_num(y, nan=-9)[None], cv2.INTER_LINEAR,
-                        borderMode=cv2.BORDER_CONSTANT, borderValue=0)[0]  # fmt: skip
+        x, y = (np.nan_to_num(a, nan=-9).reshape(u.shape) for a in (x, y))
+        out = cv2.remap(share, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0).ravel()
         off = ~((at >= -0.5).all(1) & (at[:, 0] < W - 0.5) & (at[:, 1] < H - 0.5))
     c, r = np.floor(np.where(off[:, None], 0, at) + 0.5).astype(np.intp).T
     near = np.linalg.norm(grid.xyz[r, c] - place, axis=1)

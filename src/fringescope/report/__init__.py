@@ -12,6 +12,8 @@ from fringescope.report.figures import (
     reasons_map,
     reasons_picture,
 )
+from fringescope.report.guidance import caption as guidance_caption
+from fringescope.report.guidance import guidance_preview, landing_picture
 from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_cloud, render_surface
 from fringescope.report.response import RippleCurve, response_picture
 from fringescope.report.sighting import sighting_picture
@@ -32,6 +34,9 @@ __all__ = [
     "contact_sheet",
     "error_map",
     "fringe_picture",
+    "guidance_caption",
+    "guidance_preview",
+    "landing_picture",
     "phase_picture",
     "reasons_map",
     "reasons_picture",

@@ -13,6 +13,7 @@ from fringescope.store.capture import (
     write_capture,
 )
 from fringescope.store.files import new_file, new_folder, write_json
+from fringescope.store.guidelines import parse_guidelines, pattern_document, read_guidelines
 from fringescope.store.images import Images, write_png, write_tiff
 from fringescope.store.response import read_response, response_document
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
@@ -53,6 +54,8 @@ __all__ = [
     "new_file",
     "new_folder",
     "parse_board",
+    "parse_guidelines",
+    "pattern_document",
     "plain",
     "put_capture",
     "put_decoded",
@@ -60,6 +63,7 @@ __all__ = [
     "put_scan",
     "read_board",
     "read_capture",
+    "read_guidelines",
     "read_observations",
     "read_response",
     "read_rig",

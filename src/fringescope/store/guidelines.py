@@ -1,0 +1,169 @@
+"""Guidelines: the strokes that an expert drew, and `pattern.json`, which tells what became of them on the projector."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fringescope import __version__
+from fringescope.errors import FormatError, GuidanceError
+from fringescope.store import files
+from fringescope.store.scan import plain
+from fringescope.types import Fill, Guidance, Guided, Guidelines, Side, Stroke, StrokeKind
+
+FORMAT, VERSION = "fringescope-guidelines", 1
+PATTERN_FORMAT, PATTERN_VERSION = "fringescope-pattern", 1
+
+#: names of colours that a file may use beside #rrggbb
+COLOURS = {
+    "red": "#ff3030",
+    "green": "#00ff80",
+    "blue": "#4080ff",
+    "yellow": "#ffe000",
+    "cyan": "#00e0ff",
+    "magenta": "#ff40ff",
+    "orange": "#ff9000",
+    "white": "#ffffff",
+}
+
+
+def read_guidelines(path: Path | str) -> Guidelines:
+    """The strokes of a guidelines file. What a single stroke has wrong is told in `refused`; the others are read.
+
+    Raises FormatError for a file that is none, or of a higher version, and for strokes that share an id.
+    """
+    path = Path(path)
+    return parse_guidelines(files.read_json(path, "guidelines (a file with strokes)"), path)
+
+
+def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
+    """As `read_guidelines`, of a JSON object; `path` names it in messages."""
+    files.check_format(doc, path, FORMAT, VERSION)
+    listed = doc.get("strokes")
+    if not isinstance(listed, list):
+        raise FormatError(f'{path}: "strokes" is {files.shown(listed)}; needed a list of strokes')
+    for key in ("scan", "rig"):
+        if not isinstance(doc.get(key), (str, type(None))):
+            raise FormatError(f'{path}: "{key}" is {files.shown(doc[key])}; needed a hash ("sha256:..") or nothing')
+    strokes: list[Stroke] = []
+    refused: dict[str, str] = {}
+    seen: set[str] = set()
+    for i, entry in enumerate(listed):
+        name = entry.get("id") if isinstance(entry, Mapping) else None
+        if not (isinstance(name, str) and name.strip()) or len(name) > 200:
+            name = f"strokes[{i}]"
+            refused[name] = "has no id (a word); needed one"
+            continue
+        if name in seen:
+            raise FormatError(f"{path}: two strokes have the id {files.shown(name)}; needed one id per stroke")
+        seen.add(name)
+        try:
+            strokes.append(_stroke(name, entry))
+        except GuidanceError as e:
+            refused[name] = str(e)
+    return Guidelines(tuple(strokes), doc.get("scan"), doc.get("rig"), refused)
+
+
+def _stroke(name: str, d: Mapping[str, Any]) -> Stroke:
+    numbers = {k: _number(d, k) for k in ("width_mm", "width_px", "spacing_mm", "radius_mm", "head_mm", "size_mm")}
+    given: dict[str, Any] = {k: v for k, v in numbers.items() if v is not None}
+    if d.get("count") is not None:
+        if not isinstance(d["count"], int) or isinstance(d["count"], bool):
+            raise GuidanceError(f"count is {files.shown(d['count'])}; needed a whole number")
+        given["count"] = d["count"]
+    for key, kind in (("kind", StrokeKind), ("fill", Fill), ("side", Side)):
+        if d.get(key) is not None:
+            given[key] = _choice(key, d[key], kind)
+    for key, kinds, needed in (("closed", bool, "true or false"), ("text", str, "words"), ("camera", str, "a name")):
+        if d.get(key) is not None:
+            if not isinstance(d[key], kinds):
+                raise GuidanceError(f"{key} is {files.shown(d[key])}; needed {needed}")
+            given[key] = d[key]
+    if "color" in d:
+        given["color"] = parse_colour(d["color"])
+    return Stroke(name, pixels=_list(d, "pixels"), world_mm=_list(d, "world_mm"), **given)
+
+
+def _list(d: Mapping[str, Any], key: str) -> Any:
+    value = d.get(key)
+    if value is not None and not isinstance(value, list):
+        raise GuidanceError(f"{key} is {files.shown(value)}; needed a list of points")
+    return value
+
+
+def _number(d: Mapping[str, Any], key: str) -> float | None:
+    value = d.get(key)
+    if value is None:
+        return None
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise GuidanceError(f"{key} is {files.shown(value)}; needed a number")
+    return float(value)
+
+
+def _choice(key: str, value: Any, kind: type[StrokeKind] | type[Fill] | type[Side]) -> Any:
+    try:
+        return kind(value)
+    except ValueError:
+        raise GuidanceError(f"{key} is {files.shown(value)}; there are {', '.join(k.value for k in kind)}") from None
+
+
+def parse_colour(value: Any) -> tuple[int, int, int]:
+    """ "#ff3030", "#f33" or a name to red, green, blue, 0..255 of sRGB. Raises GuidanceError."""
+    text = COLOURS.get(value.strip().lower(), value.strip()) if isinstance(value, str) else ""
+    if re.fullmatch(r"#[0-9a-fA-F]{3}", text):
+        text = "#" + "".join(2 * c for c in text[1:])
+    if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
+        raise GuidanceError(f"color is {files.shown(value)}; needed #rrggbb or one of {', '.join(COLOURS)}")
+    r, g, b = (int(text[i : i + 2], 16) for i in (1, 3, 5))
+    return r, g, b
+
+
+# ------------------------------------------------------------------------------------------------------------ pattern
+
+
+def pattern_document(
+    guidance: Guidance, refused: Mapping[str, str], extra: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """`pattern.json`: per stroke its visible pieces on the projector's plane, what is hidden and why, how exact."""
+    strokes = [_entry(g) for g in guidance.strokes]
+    strokes += [{"id": k, "segments": [], "hidden": [], "expected_error_um": None, "refused": v}
+                for k, v in refused.items()]  # fmt: skip
+    return {
+        "format": PATTERN_FORMAT,
+        "version": PATTERN_VERSION,
+        "software": {"name": "fringescope", "version": __version__},
+        "scan": guidance.scan,
+        "rig": guidance.rig,
+        "device": {"width": guidance.image.shape[1], "height": guidance.image.shape[0]},
+        "strokes": strokes,
+        **plain(extra or {}),
+    }
+
+
+def _entry(g: Guided) -> dict[str, Any]:
+    out: dict[str, Any] = {
+        "id": g.stroke.id,
+        "kind": g.stroke.kind.value,
+        "segments": [_rounded(s) for s in g.segments],
+        "hidden": [
+            {"segment": _rounded(h.segment), "why": h.why.value, "length_mm": round(h.length_mm, 3)} for h in g.hidden
+        ],
+        "expected_error_um": None if g.expected_error_um is None else round(g.expected_error_um, 2),
+    }
+    if g.refused is not None:
+        return {**out, "refused": g.refused}
+    out |= {"visible": round(g.visible, 4), "length_mm": round(g.length_mm, 3)}
+    out |= {"length_sigma_mm": round(g.length_sigma_mm, 4)}
+    if g.area_mm2 is not None and g.area_sigma_mm2 is not None:
+        out |= {"area_mm2": round(g.area_mm2, 3), "area_sigma_mm2": round(g.area_sigma_mm2, 4)}
+    return {**out, "notes": list(g.notes)}
+
+
+def _rounded(points: Any) -> list[list[float]]:
+    """Plane coordinates to a thousandth of a unit: a twentieth of a micrometre on the tissue."""
+    rounded: list[list[float]] = np.round(np.asarray(points, np.float64), 3).tolist()
+    return rounded
