@@ -23,6 +23,7 @@ from fringescope.devices.base import (
     Shot,
     Shutter,
     Trigger,
+    TriggerSource,
 )
 from fringescope.errors import CaptureError, DeviceTimeoutError, IncompleteShotError, RejectedError
 from fringescope.settings import CaptureSettings
@@ -164,6 +165,28 @@ def photograph(
         if not frame.complete:
             raise IncompleteShotError(f"{c.info.uri}: the ring-light picture came incomplete; take it again")
     return tuple(f.pixels for f in frames)
+
+
+def snapshots(
+    cameras: Sequence[Camera], pixel_formats: Sequence[PixelFormat], exposure_us: int, timeout_s: float = 5.0
+) -> tuple[AnyArray, ...]:
+    """One picture of each camera of what there is to see now, one after the other: raw frames (H, W).
+
+    Raises IncompleteShotError where none comes or it is not whole, RejectedError where a camera cannot.
+    """
+    out = []
+    for c, f in zip(cameras, pixel_formats, strict=True):
+        c.configure(CameraSettings(f, exposure_us))
+        with c.arm(1, Trigger(TriggerSource.SOFTWARE, timeout_s)) as acquisition:
+            acquisition.trigger()
+            try:
+                frame = next(iter(acquisition))
+            except (DeviceTimeoutError, StopIteration) as e:
+                raise IncompleteShotError(f"{c.info.uri}: no picture came; check the camera and try again") from e
+        if not frame.complete:
+            raise IncompleteShotError(f"{c.info.uri}: the picture came incomplete; take it again")
+        out.append(frame.pixels)
+    return tuple(out)
 
 
 def label(key: FrameKey) -> str:

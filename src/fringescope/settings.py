@@ -268,6 +268,22 @@ class GuideSettings(_Section):
 
 
 @dataclass(frozen=True)
+class LoopSettings(_Section):
+    """Finding the projected lines, to measure where they landed (IV-D)."""
+
+    station_mm: float = knob(0.5, "mm", "a projected line is looked for this closely along it", "IV-D", 0.05)
+    along_mm: float = knob(0.7, "mm", "half length of the piece of line that a station looks at", "", 0.05)
+    search_mm: float = knob(0.6, "mm", "how far from where it should be a line is looked for", "", 0.05, 10)
+    blur_mm: float = knob(0.12, "mm", "softness of a projected line's edges that is expected (standard deviation)", "", 0.001)
+    min_height: float = knob(0.2, "", "least height of a line's profile, of what it should be", "", 0, 1)
+    max_misfit: float = knob(0.35, "", "greatest rms misfit of a line's profile, of its height", "", 0)
+    surface_mm: float = knob(0.03, "mm", "error of the scanned surface that is expected when lines are triangulated", "", 0.001)
+    max_height_mm: float = knob(0.15, "mm", "lines that lie farther off the scanned surface say that it has changed", "", 0)
+    accept_um: float = knob(150.0, "um", "guidance whose lines land farther than this from the asked ones (p95) is not as it should be", "", 1)
+    exposure_us: int = knob(16000, "us", "exposure of the pictures in which lines are looked for", "", 10, 10_000_000)
+
+
+@dataclass(frozen=True)
 class Settings(_Section):
     """The whole tree, as stored in every scan."""
 
@@ -283,6 +299,7 @@ class Settings(_Section):
     response: ResponseSettings = field(default_factory=ResponseSettings)
     verify: VerifySettings = field(default_factory=VerifySettings)
     guide: GuideSettings = field(default_factory=GuideSettings)
+    loop: LoopSettings = field(default_factory=LoopSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,10 +11,12 @@ import typer
 
 from fringescope.cli.app import app
 from fringescope.cli.common import Force, Json, Progress, SetOption, SettingsFile, emit, existing, load_settings
-from fringescope.errors import EmptyResultError, FormatError, UsageError
+from fringescope.errors import EmptyResultError, FormatError, GuidanceError, UsageError
 
 if TYPE_CHECKING:
-    from fringescope.types import Guidance
+    from fringescope.devices.base import Station
+    from fringescope.store import StoredScan
+    from fringescope.types import U8, Guidance, Landing
 
 
 @app.command()
@@ -25,6 +28,12 @@ def guide(
     preview: Annotated[
         bool, typer.Option(help="Also write how it will look in each camera: pattern-camera1.png ..")
     ] = True,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Show it on the instrument, photograph it, and say where it lands.")
+    ] = False,
+    device: Annotated[
+        str | None, typer.Option(metavar="URI", help="The instrument for --verify; default: the one that made the scan.")
+    ] = None,
     dashed: Annotated[
         bool, typer.Option("--dashed", help="Draw dashes: it is in doubt whether the strokes still fit.")
     ] = False,
@@ -48,6 +57,7 @@ def guide(
         if stored.document.get("rig") != hashes[1]:
             raise FormatError(f"{rig}: is not the rig that {scan} was made with; reconstruct with this rig first")
         from fringescope import export
+        from fringescope.pipeline import closing
         from fringescope.pipeline import guidance as recipe
 
         recipe.check_bound(asked, *hashes)
@@ -55,11 +65,18 @@ def guide(
             raise EmptyResultError(f"{scan}: the scan has no surface, so nothing can be drawn on it; scan again")
         tissue = recipe.tissue_of(stored.grids, export.read_glb(stored.surface), r, s)
         made = progress.run("strokes", lambda: recipe.project_guidance(asked, tissue, s, dashed=dashed))
-        pictures = {}
+        pictures: dict[str, U8] = {}
+        landings: Sequence[Landing] = ()
+        if verify:
+            with open_instrument(device, stored) as station:
+                closed = progress.run("closed loop", lambda: closing.close_loop(made, tissue, station, s))
+            landings = closed.landings
+            pictures = {f"{c}-landed": p for c, p in closing.landing_pictures(closed, r, s).items()}
         if preview and all(p is not None for p in stored.pictures):
-            pictures = progress.run("previews", lambda: recipe.previews(made, tissue, stored.every_picture(), s))
-    doc = store.pattern_document(made, asked.refused, {"scan": hashes[0], "rig": hashes[1]})
-    lines = [*summary(made), *(f"{k}: not shown: {v}" for k, v in asked.refused.items())]
+            seen = progress.run("previews", lambda: recipe.previews(made, tissue, stored.every_picture(), s))
+            pictures |= seen
+    doc = store.pattern_document(made, asked.refused, landings, {"scan": hashes[0], "rig": hashes[1]})
+    lines = [*summary(made, landings), *(f"{k}: not shown: {v}" for k, v in asked.refused.items())]
     if not asked.strokes and not asked.refused:
         lines.append("no strokes: the picture is dark")
     if not any(g.segments for g in made.strokes) and (made.strokes or asked.refused):
@@ -75,10 +92,34 @@ def guide(
             store.write_png(path, pictures[camera])
     result: dict[str, Any] = {"pattern": str(out), **doc, "previews": {c: str(p) for c, p in beside.items()}}
     emit(result, json, [f"{out}: {len(made.strokes) + len(asked.refused)} strokes", *lines])
+    far = [x for x in landings if x.p95_um is not None and x.p95_um > s.loop.accept_um]
+    if far:
+        raise GuidanceError(
+            f"{far[0].id} lands {far[0].p95_um:.0f} um (p95) from where it was asked for; needed {s.loop.accept_um:.0f}: "
+            "verify the rig, and scan again if the specimen moved"
+        )
+    if landings and all(x.median_um is None for x in landings):
+        raise EmptyResultError("no projected line was found in any picture; " + "; ".join(landings[0].words))
 
 
-def summary(made: Guidance) -> list[str]:
-    """A line for people per stroke, and its notes."""
-    from fringescope.report import guidance_caption
+def open_instrument(device: str | None, scan: StoredScan) -> Station:
+    """The instrument at a URI, or the one that a scan was made with. Raises UsageError where neither is known."""
+    from fringescope.devices import registry
 
-    return [line for g in made.strokes for line in (guidance_caption(g), *(f"  {n}" for n in g.notes))]
+    uri = device or scan.instrument
+    if uri is None:
+        raise UsageError("which instrument made this scan is not known; name it with --device URI (fringescope devices)")
+    return registry.open_station(uri)
+
+
+def summary(made: Guidance, landings: Sequence[Landing] = ()) -> list[str]:
+    """A line for people per stroke, its notes, and where it landed."""
+    from fringescope.report import guidance_caption, landing_caption
+
+    landed = {x.id: x for x in landings}
+    out = []
+    for g in made.strokes:
+        out += [guidance_caption(g), *(f"  {n}" for n in g.notes)]
+        if g.stroke.id in landed:
+            out.append(f"  landed: {landing_caption(landed[g.stroke.id])}")
+    return out

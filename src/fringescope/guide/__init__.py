@@ -14,12 +14,15 @@ from fringescope.guide import curves, fills
 from fringescope.guide.drape import Samples, Source, drape
 from fringescope.guide.draw import Canvas
 from fringescope.guide.fills import Patch
+from fringescope.guide.find import Shots, landings
 from fringescope.guide.tissue import Tissue, tissue
 from fringescope.guide.trace import guided, hidden_parts, mirror_units, trace, visible_runs
 from fringescope.settings import GuideSettings
 from fringescope.types import Fill, Guidance, Guided, Guidelines, Hidden, HiddenPart, Stroke, StrokeKind
 
-__all__ = ["Tissue", "guide", "hidden_parts", "mirror_units", "place", "tissue", "visible_runs"]
+__all__ = [
+    "Shots", "Tissue", "guide", "hidden_parts", "landings", "mirror_units", "place", "tissue", "visible_runs",
+]  # fmt: skip
 
 
 def guide(

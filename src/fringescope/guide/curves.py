@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from fringescope import geometry
 from fringescope.errors import GuidanceError
 from fringescope.guide.drape import Samples, Source, on_surface, places
 from fringescope.guide.tissue import Tissue
-from fringescope.guide.trace import smoothed
+from fringescope.guide.trace import direction, smoothed
 from fringescope.settings import GuideSettings
 from fringescope.types import F64, Bool, Side, Stroke
 from fringescope.types.guidance import WIDTH_MM
@@ -88,32 +89,39 @@ def offsets(line: Samples, stroke: Stroke, tissue: Tissue) -> list[Samples]:
     known = (line.source != Source.NOBODY) & np.isfinite(line.xyz).all(1)
     if known.sum() < 2:
         return []
-    base, piece = line.xyz[known], line.piece[known]
+    base = line.xyz[known]
+    piece = _parts(line.piece[known], np.flatnonzero(known), 1)
     pace = float(np.median(np.linalg.norm(np.diff(base, axis=0), axis=1)))
     window = 2 * int(np.clip(round(0.5 / max(pace, 1e-6)), 0, 100)) + 1
     base = smoothed(base, piece, window)
-    tangent = np.gradient(base, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     normal = tissue.relief.of(tissue.relief.normal, geometry.project(tissue.rig.projector, base))
-    aside = np.cross(tangent, normal)  # to the right of one who looks at it from the projector
+    # to the right of one who looks at it from the projector
+    aside = np.cross(direction(base, piece), normal)
     known = np.isfinite(aside).all(1)
     sides = {Side.RIGHT: (1,), Side.LEFT: (-1,), Side.BOTH: (1, -1)}[stroke.side]
-    return [
-        _parallel(base[known], piece[known], side * aside[known], k * stroke.spacing_mm, tissue)
+    lines = [
+        _parallel(base[known], piece[known], side * aside[known], k * stroke.spacing_mm, pace, tissue)
         for k in range(1, stroke.count + 1)
         for side in sides
     ]
+    return [line for line in lines if len(line)]
 
 
-def _parallel(base: F64, piece: F64, aside: F64, distance: float, tissue: Tissue) -> Samples:
+def _parallel(base: F64, piece: Any, aside: F64, distance: float, pace: float, tissue: Tissue) -> Samples:
     from scipy.spatial import cKDTree  # only who draws such lines needs it
 
     p, ground = tissue.relief.walk(base, aside, np.full(len(base), distance))
     near = cKDTree(base).query(p)[0]
     # the straight distance is less than that along the surface; the line's own crossings come much nearer
-    straight = np.linalg.norm(p - base, axis=1)
-    keep = near >= 0.97 * straight
-    return on_surface(p[keep], ground[keep], piece[keep])
+    keep = np.flatnonzero(near >= 0.97 * np.linalg.norm(p - base, axis=1))
+    p = p[keep]
+    parts = _parts(piece[keep], np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))]), 10 * pace)
+    return on_surface(p, ground[keep], parts)
+
+
+def _parts(piece: Any, at: Any, most: float) -> Any:
+    """Numbers of unbroken pieces (n,), broken also where `at` goes on by more than `most`."""
+    return np.concatenate([[0], np.cumsum((np.diff(piece) != 0) | (np.diff(at) > most))]).astype(np.int32)[: len(piece)]
 
 
 def hatch(outline: F64, stroke: Stroke, tissue: Tissue, s: GuideSettings) -> list[Samples]:

@@ -122,7 +122,7 @@ def _seen(pixels: F64, camera: str, tissue: Tissue, s: GuideSettings) -> Samples
         ok = np.asarray(np.isfinite(found).all(1))
         ok[ok] = tissue.supported(found[ok], camera)
         xyz[gaps[ok]], source[gaps[ok]] = found[ok], Source.OTHERS
-        sigma[gaps[ok]] = float(np.median(grid.sigma[grid.reasons == 0][::101])) if (grid.reasons == 0).any() else 0.0
+        sigma[gaps[ok]] = tissue.sigmas[number]
     sigma = np.where(source == Source.NOBODY, 0.0, sigma)
     return Samples(xyz, source, rays, sigma, np.zeros(len(pixels), np.int32))
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fringescope.guide.fills import Patch
-from fringescope.guide.trace import runs, visible_runs
+from fringescope.guide.trace import visible_runs
 from fringescope.kernels import guiding as k
 from fringescope.settings import GuideSettings
 from fringescope.types import F32, F64, U8, Guided, Layout, Projector, Trace
@@ -26,6 +26,7 @@ class Canvas:
     def __init__(self, projector: Projector) -> None:
         self._projector = projector
         self._light = np.zeros((projector.height, projector.width, 3), np.float32)
+        self._touched = (slice(projector.height, 0), slice(projector.width, 0))
 
     def stroke(self, g: Guided, patches: Sequence[Patch], s: GuideSettings, dashed: bool) -> None:
         """Paints what of a stroke is visible."""
@@ -39,28 +40,38 @@ class Canvas:
         if not len(every):
             return
         reach = np.maximum(every[:, 2], every[:, 5]).max() + 2
-        h = self._projector.height
-        top = int(np.clip(math.floor(every[:, [1, 4]].min() - reach), 0, h - 1))
-        end = int(np.clip(math.ceil(every[:, [1, 4]].max() + reach) + 1, top + 1, h))
-        share = np.zeros((end - top, self._projector.width), np.float32)
-        k.ribbons(every, self._projector.layout is Layout.DIAMOND, top, share)
-        self._paint(share, top, 0, color)
+        diamond = self._projector.layout is Layout.DIAMOND
+        step = 2 if diamond else 1
+        spans = []
+        for axis, size, unit in ((0, self._projector.width, step), (1, self._projector.height, 1)):
+            first = int(np.clip(math.floor((every[:, [axis, axis + 3]].min() - reach) / unit), 0, size - 1))
+            end = int(np.clip(math.ceil((every[:, [axis, axis + 3]].max() + reach) / unit) + 1, first + 1, size))
+            spans.append((first, end))
+        (left, right), (top, bottom) = spans
+        share = np.zeros((bottom - top, right - left), np.float32)
+        every[:, [0, 3]] -= left * step
+        k.ribbons(every, diamond, top, share)
+        self._paint(share, top, left, color)
 
     def _paint(self, share: F32, top: int, left: int, color: F32) -> None:
         if left < 0 or top < 0:
             share, left, top = share[max(-top, 0) :, max(-left, 0) :], max(left, 0), max(top, 0)
         part = self._light[top : top + share.shape[0], left : left + share.shape[1]]
         share = share[: part.shape[0], : part.shape[1]]
-        rows, columns = np.flatnonzero(share.any(1)), np.flatnonzero(share.any(0))
-        if not rows.size:
-            return
-        cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-        a = share[cut][..., None]
-        part[cut] = part[cut] * (1 - a) + a * color
+        a = share[..., None]
+        part *= 1 - a
+        part += a * color
+        rows, columns = part.shape[:2]
+        self._touched = (
+            slice(min(self._touched[0].start, top), max(self._touched[0].stop, top + rows)),
+            slice(min(self._touched[1].start, left), max(self._touched[1].stop, left + columns)),
+        )
 
     def image(self) -> U8:
         """The picture (height, width, 3) RGB."""
-        out: U8 = np.clip(np.rint(self._light * 255), 0, 255).astype(np.uint8)
+        out: U8 = np.zeros(self._light.shape, np.uint8)
+        if self._touched[0].stop:
+            out[self._touched] = np.clip(np.rint(self._light[self._touched] * 255), 0, 255)
         return out
 
 
@@ -73,9 +84,3 @@ def ribbons_of(t: Trace, first: int, last: int, dash_mm: float | None) -> F64:
         on = (gone[:-1] % (2 * dash_mm)) < dash_mm
         out = out[on]
     return np.ascontiguousarray(out[np.isfinite(out).all(1)])
-
-
-def drawn_rows(image: U8) -> list[tuple[int, int]]:
-    """Runs of rows of a picture in which something is lit."""
-    lit = np.asarray(image.reshape(len(image), -1).any(1))
-    return [(a, b) for a, b in runs(lit) if lit[a]]

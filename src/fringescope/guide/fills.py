@@ -110,7 +110,10 @@ def in_photograph(pixels: F64, camera: str, tissue: Tissue) -> tuple[F32, Any] |
     near = np.linalg.norm(grid.xyz[r, c] - place, axis=1)
     same = (grid.reasons[r, c] == 0) & (near < 0.5 + 4 * tissue.footprints[number])
     lone = (grid.reasons[r, c] != 0) & tissue.supported(np.nan_to_num(place), camera)
-    out[off | ~(same | lone) | ~np.isfinite(place).all(1)] = 0
+    there = np.isfinite(place).all(1)
+    seen = (~off & (same | lone) & there).reshape(u.shape)
+    whole = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))  # specks of noise
+    out[~(seen | (whole > 0)).ravel() | ~there] = 0
     return out.reshape(u.shape), a
 
 

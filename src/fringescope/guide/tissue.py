@@ -26,6 +26,7 @@ class Tissue:
     relief: Relief
     spans: tuple[tuple[float, float], ...]  #: nearest and farthest range of each grid's points from its camera, mm
     footprints: tuple[float, ...]  #: mm that a pixel of each grid covers, across its ray
+    sigmas: tuple[float, ...]  #: median of the error along its rays, mm
 
     def number(self, camera: str) -> int:
         """Which of the grids is that of a camera. Raises GuidanceError if the scan has none."""
@@ -54,17 +55,20 @@ def tissue(grids: Sequence[Grid], surface: Surface | None, rig: Rig, s: GuideSet
     """A scan's grids and its surface, made ready. Raises EmptyResultError for a scan without a surface or points."""
     if surface is None or not surface.n_faces:
         raise EmptyResultError("the scan has no surface, so nothing can be drawn on it; scan again with more points")
-    spans, footprints = [], []
+    spans, footprints, sigmas = [], [], []
     for g in grids:
         camera = rig.cameras[g.view]
         every = tuple(slice(None, None, max(1, n // 400)) for n in g.reasons.shape)
-        seen = g.xyz[every][g.reasons[every] == 0]
+        there = g.reasons[every] == 0
+        seen = g.xyz[every][there]
         if not len(seen):
             spans.append((np.nan, np.nan))
             footprints.append(0.0)
+            sigmas.append(0.0)
             continue
         far = np.linalg.norm(seen.astype(np.float64) - geometry.centre(camera.pose), axis=1)
         spans.append((float(far.min()) - 1.0, float(far.max()) + 1.0))
         footprints.append(float(np.median(far)) / float(camera.lens.K[0, 0]))
+        sigmas.append(float(np.median(g.sigma[every][there])))
     made = relief.of_surface(surface, rig.projector, s)
-    return Tissue(rig, tuple(grids), made, tuple(spans), tuple(footprints))
+    return Tissue(rig, tuple(grids), made, tuple(spans), tuple(footprints), tuple(sigmas))

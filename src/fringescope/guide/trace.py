@@ -96,7 +96,11 @@ def _tangent(xyz: F64, piece: Any, pace: float) -> F64:
     steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
     usual = float(np.nanmedian(steps)) if np.isfinite(steps).any() else pace
     window = 2 * int(np.clip(round(0.5 * SMOOTH_MM / max(usual, 1e-6)), 0, 50)) + 1
-    p = smoothed(xyz, piece, window)
+    return direction(smoothed(xyz, piece, window), piece)
+
+
+def direction(p: F64, piece: Any) -> F64:
+    """Unit direction (n, 3) of pieces of polyline at their points (n, 3)."""
     if len(p) == 1:
         return np.array([[1.0, 0.0, 0.0]])
     ahead, behind = np.vstack([p[1:], p[-1:]]), np.vstack([p[:1], p[:-1]])

@@ -13,7 +13,7 @@ from fringescope.report.figures import (
     reasons_picture,
 )
 from fringescope.report.guidance import caption as guidance_caption
-from fringescope.report.guidance import guidance_preview, landing_picture
+from fringescope.report.guidance import guidance_preview, landing_caption, landing_picture
 from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_cloud, render_surface
 from fringescope.report.response import RippleCurve, response_picture
 from fringescope.report.sighting import sighting_picture
@@ -36,6 +36,7 @@ __all__ = [
     "fringe_picture",
     "guidance_caption",
     "guidance_preview",
+    "landing_caption",
     "landing_picture",
     "phase_picture",
     "reasons_map",

@@ -69,6 +69,14 @@ def caption(g: Guided) -> str:
     return ", ".join(parts)
 
 
+def landing_caption(x: Landing) -> str:
+    """One line on where a stroke landed, for people."""
+    if x.median_um is None:
+        return "; ".join(("not found", *x.words))
+    told = f"median {x.median_um:.0f}, p95 {x.p95_um:.0f}, max {x.max_um:.0f} um from where it was asked for"
+    return "; ".join((told, *x.words))
+
+
 def landing_picture(
     photo: F32, camera: Camera, index: int, landings: tuple[Landing, ...], wide: int = WIDE, times: float = 20.0
 ) -> U8:
@@ -89,10 +97,7 @@ def landing_picture(
             if np.isfinite([*p, *q]).all():
                 _line(out, q, q + times * (p - q), (255, 64, 64), 1)
                 cv2.circle(out, (round(p[0] * 16), round(p[1] * 16)), 24, (64, 255, 96), -1, cv2.LINE_AA, 4)
-        told = "not found" if one.median_um is None else (
-            f"median {one.median_um:.0f}, p95 {one.p95_um:.0f}, max {one.max_um:.0f} um"
-        )  # fmt: skip
-        lines.append(f"{one.id}: {told}")
+        lines.append(f"{one.id}: {landing_caption(one)}")
     return _captioned(out, [*lines, f"red: offset, {times:g} times"])
 
 

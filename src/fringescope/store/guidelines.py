@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from fringescope import __version__
 from fringescope.errors import FormatError, GuidanceError
 from fringescope.store import files
 from fringescope.store.scan import plain
-from fringescope.types import Fill, Guidance, Guided, Guidelines, Side, Stroke, StrokeKind
+from fringescope.types import Fill, Guidance, Guided, Guidelines, Landing, Side, Stroke, StrokeKind
 
 FORMAT, VERSION = "fringescope-guidelines", 1
 PATTERN_FORMAT, PATTERN_VERSION = "fringescope-pattern", 1
@@ -126,10 +126,17 @@ def parse_colour(value: Any) -> tuple[int, int, int]:
 
 
 def pattern_document(
-    guidance: Guidance, refused: Mapping[str, str], extra: Mapping[str, Any] | None = None
+    guidance: Guidance,
+    refused: Mapping[str, str],
+    landings: Sequence[Landing] = (),
+    extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """`pattern.json`: per stroke its visible pieces on the projector's plane, what is hidden and why, how exact."""
-    strokes = [_entry(g) for g in guidance.strokes]
+    """`pattern.json`: per stroke its visible pieces on the projector's plane, what is hidden and why, how exact.
+
+    With `landings` each stroke also tells where it was found to land.
+    """
+    found = {x.id: x for x in landings}
+    strokes = [_entry(g, found.get(g.stroke.id)) for g in guidance.strokes]
     strokes += [{"id": k, "segments": [], "hidden": [], "expected_error_um": None, "refused": v}
                 for k, v in refused.items()]  # fmt: skip
     return {
@@ -144,7 +151,7 @@ def pattern_document(
     }
 
 
-def _entry(g: Guided) -> dict[str, Any]:
+def _entry(g: Guided, landed: Landing | None) -> dict[str, Any]:
     out: dict[str, Any] = {
         "id": g.stroke.id,
         "kind": g.stroke.kind.value,
@@ -160,6 +167,13 @@ def _entry(g: Guided) -> dict[str, Any]:
     out |= {"length_sigma_mm": round(g.length_sigma_mm, 4)}
     if g.area_mm2 is not None and g.area_sigma_mm2 is not None:
         out |= {"area_mm2": round(g.area_mm2, 3), "area_sigma_mm2": round(g.area_sigma_mm2, 4)}
+    if landed is not None:
+        figures = {k: getattr(landed, k) for k in ("median_um", "p95_um", "max_um")}
+        out["landed"] = {
+            **{k: None if v is None else round(v, 2) for k, v in figures.items()},
+            "share": round(landed.share, 3),
+            "words": list(landed.words),
+        }
     return {**out, "notes": list(g.notes)}
 
 

@@ -1,0 +1,79 @@
+"""The closed loop: show the guidance, photograph it, find its lines, and say how far they are from the asked ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fringescope import capture, fuse, guide, report
+from fringescope.devices.base import Camera, Station
+from fringescope.errors import DeviceError
+from fringescope.settings import Settings
+from fringescope.types import U8, Guidance, Landing, PixelFormat, Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """What the closed loop found: per stroke where it landed; and the pictures that it took."""
+
+    landings: tuple[Landing, ...]
+    shots: tuple[guide.Shots, ...]
+
+    @property
+    def worst_um(self) -> float | None:
+        """The largest p95 of all strokes, um; None where no line was found."""
+        return max((x.p95_um for x in self.landings if x.p95_um is not None), default=None)
+
+
+def close_loop(guidance: Guidance, tissue: guide.Tissue, station: Station, settings: Settings | None = None) -> Closed:
+    """Shows the guidance on an instrument, and measures where it lands. The projector is dark afterwards.
+
+    Raises what devices raise, and DeviceError where the instrument lacks a camera of the scan or shows other pictures.
+    """
+    s = settings or Settings()
+    i = station.projector.info
+    if guidance.image.shape[:2] != (i.height, i.width):
+        h, w = guidance.image.shape[:2]
+        raise DeviceError(f"{i.uri} shows {i.width} x {i.height}; the guidance is for {w} x {h}: use the rig's device")
+    cameras = cameras_of(station, tissue.rig, [g.camera for g in tissue.grids])
+    formats = [c.settings.pixel_format for c in cameras]
+    image = guidance.image if i.colours else np.asarray(guidance.image.max(axis=2))
+    taken = []
+    try:
+        for picture in (None, np.full((i.height, i.width), 255, np.uint8), image):
+            if picture is None:
+                station.projector.dark()
+            else:
+                station.projector.show(picture)
+            taken.append(capture.snapshots(cameras, formats, s.loop.exposure_us, s.capture.timeout_s))
+    finally:
+        station.projector.dark()
+    shots = tuple(
+        guide.Shots(g.camera, f, *frames) for g, f, *frames in zip(tissue.grids, formats, *taken, strict=True)
+    )
+    return Closed(guide.landings(guidance, shots, tissue, s.loop), shots)
+
+
+def cameras_of(station: Station, rig: Rig, names: Sequence[str]) -> list[Camera]:
+    """The cameras of a station by the rig's names, whose order they have. Raises DeviceError if there are fewer."""
+    order = [c.name for c in rig.cameras]
+    if len(station.cameras) < len(order):
+        raise DeviceError(f"the instrument has {len(station.cameras)} cameras; the rig has {', '.join(order)}")
+    return [station.cameras[order.index(n)] for n in names]
+
+
+def landing_pictures(closed: Closed, rig: Rig, s: Settings) -> dict[str, U8]:
+    """Where the lines were found, over what each camera saw: (h, w, 3) RGB by the camera's name."""
+    out = {}
+    for shot in closed.shots:
+        photo = fuse.photo(shot.guided, shot.pixel_format, shot.camera, s.fuse)
+        index = rig.index(shot.camera)
+        out[shot.camera] = report.landing_picture(photo.rgb, rig.cameras[index], index, closed.landings)
+    return out
+
+
+def formats_of(station: Station) -> list[PixelFormat]:
+    """What each camera of a station records now."""
+    return [c.settings.pixel_format for c in station.cameras]
