@@ -32,7 +32,7 @@ def guide(
         bool, typer.Option("--verify", help="Show it on the instrument, photograph it, and say where it lands.")
     ] = False,
     device: Annotated[
-        str | None, typer.Option(metavar="URI", help="The instrument for --verify; default: the one that made the scan.")
+        str | None, typer.Option(metavar="URI", help="The instrument for --verify; default: that of the scan.")
     ] = None,
     dashed: Annotated[
         bool, typer.Option("--dashed", help="Draw dashes: it is in doubt whether the strokes still fit.")
@@ -95,8 +95,8 @@ def guide(
     far = [x for x in landings if x.p95_um is not None and x.p95_um > s.loop.accept_um]
     if far:
         raise GuidanceError(
-            f"{far[0].id} lands {far[0].p95_um:.0f} um (p95) from where it was asked for; needed {s.loop.accept_um:.0f}: "
-            "verify the rig, and scan again if the specimen moved"
+            f"{far[0].id} lands {far[0].p95_um:.0f} um (p95) from where it was asked for; needed "
+            f"{s.loop.accept_um:.0f}: verify the rig, and scan again if the specimen moved"
         )
     if landings and all(x.median_um is None for x in landings):
         raise EmptyResultError("no projected line was found in any picture; " + "; ".join(landings[0].words))
@@ -108,7 +108,7 @@ def open_instrument(device: str | None, scan: StoredScan) -> Station:
 
     uri = device or scan.instrument
     if uri is None:
-        raise UsageError("which instrument made this scan is not known; name it with --device URI (fringescope devices)")
+        raise UsageError("which instrument made this scan is not known; name it with --device URI")
     return registry.open_station(uri)
 
 
