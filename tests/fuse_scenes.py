@@ -105,8 +105,8 @@ def grid(r, view, hit, sigma=0.005, rng=None, keep=None):
             lit
             & np.isfinite(t)
             & (uv > 0).all(-1)
-            & (uv[..., 0] < r.projector.width - 1)
-            & (uv[..., 1] < r.projector.height - 1)
+            & (uv[..., 0] < r.projector.plane_size[0] - 1)
+            & (uv[..., 1] < r.projector.plane_size[1] - 1)
         )
     if keep is not None:
         ok &= keep(p, u, v)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from fringescope.errors import GuidanceError
-from fringescope.guide import curves, fills
-from fringescope.guide.drape import Samples, Source, drape
+from fringescope.guide import curves, drape, fills
+from fringescope.guide.drape import Samples, Source
 from fringescope.guide.draw import Canvas
 from fringescope.guide.fills import Patch
 from fringescope.guide.find import Shots, landings
@@ -55,7 +55,7 @@ def place(
 def _place(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: float) -> tuple[Guided, list[Patch]]:
     if stroke.kind is StrokeKind.TEXT:
         return _text(stroke, tissue, s, calibration_mm)
-    lines = [curves.circle(stroke, tissue, s) if stroke.kind is StrokeKind.CIRCLE else drape(stroke, tissue, s)]
+    lines = [curves.circle(stroke, tissue, s) if stroke.kind is StrokeKind.CIRCLE else drape.drape(stroke, tissue, s)]
     notes = lines[0].notes
     if stroke.kind is StrokeKind.ARROW:
         lines += curves.head(lines[0], stroke, tissue, s)

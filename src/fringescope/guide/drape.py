@@ -128,7 +128,10 @@ def _seen(pixels: F64, camera: str, tissue: Tissue, s: GuideSettings) -> Samples
 
 
 def _along_rays(origin: F64, rays: F64, tissue: Tissue, number: int) -> F64:
-    """Where rays (n, 3) from a camera first come down onto the lit surface; NaN where they do not (n, 3)."""
+    """Where rays (n, 3) from a camera first come down onto the lit surface; NaN where they do not (n, 3).
+
+    A ray that went behind something before, into its shadow, may have ended there, where nobody saw it.
+    """
     near, far = tissue.spans[number]
     out = np.full(rays.shape, np.nan)
     if not np.isfinite(near):
@@ -143,9 +146,10 @@ def _along_rays(origin: F64, rays: F64, tissue: Tissue, number: int) -> F64:
         gap = depth - ground
         with np.errstate(invalid="ignore"):
             lands = (gap[:, :-1] < 0) & (gap[:, 1:] >= 0) & (gap[:, 1:] - gap[:, :-1] < 4 * MARCH_MM)
-        hit = lands.any(1)
-        i = lands.argmax(1)
+            behind = gap[:, 1:] >= 0
         row = np.arange(len(block))
+        i = behind.argmax(1)
+        hit = lands[row, i]
         a, b = gap[row, i], gap[row, np.minimum(i + 1, len(t) - 1)]
         with np.errstate(invalid="ignore", divide="ignore"):
             reach = t[i] + MARCH_MM * a / (a - b)
@@ -200,20 +204,19 @@ def from_world(points: F64, closed: bool, tissue: Tissue, s: GuideSettings) -> S
     between = (left < index) & (index < right)
     dropped = between & lit[left] & lit[right]
     ground = tissue.relief.at(uv)
-    xyz = np.where(dropped[:, None], ground, xyz)
+    xyz = np.where((dropped & np.isfinite(ground).all(1))[:, None], ground, xyz)
     source = np.full(len(xyz), int(Source.ASKED))
     source[dropped] = Source.SURFACE
     nowhere = ~there & ~dropped
     nowhere[nowhere] = ~_beside(xyz[nowhere], uv[nowhere], tissue, s)
     if (bridged := ~there & ~dropped & ~nowhere).any():
         notes.append(f"{bridged.mean():.0%} of it crosses gaps of the measured surface, at the places asked for")
-    lost = (floats & ~dropped) | nowhere | ~np.isfinite(xyz).all(1)
+    lost = (floats & ~dropped) | nowhere | (dropped & ~np.isfinite(ground).all(1)) | ~np.isfinite(xyz).all(1)
     source[lost] = Source.NOBODY
     at_ends = floats[ends]
     if at_ends.any():
         worst = float(-gap[ends][at_ends].min())
         notes.append(f"{at_ends.sum()} of {len(ends)} points float above the surface, up to {worst:.1f} mm")
-    xyz, _ = _bridged(np.where(lost[:, None], np.nan, xyz))
     none = np.full(len(xyz), np.nan)
     return Samples(
         xyz, source, np.stack([none] * 3, 1), np.zeros(len(xyz)), np.zeros(len(xyz), np.int32), tuple(notes)
@@ -250,7 +253,7 @@ def known_gap(xyz: F64, uv: F64, tissue: Tissue) -> tuple[F64, F64]:
     away = r.of(r.away, uv)
     behind = geometry.transform(tissue.rig.projector.pose, xyz)[:, 2] - r.of(r.beside, uv)
     with np.errstate(invalid="ignore"):
-        rim = np.isnan(gap) & (away > 0) & (away <= RIM_PIXELS * max(tissue.footprints))
+        rim = np.isnan(gap) & (away > 0) & (away <= RIM_PIXELS * max(tissue.footprints, default=0.0))
         rim &= behind > np.maximum(DEEP_MM, 4 * away)
     return np.where(rim, behind, gap), slack
 

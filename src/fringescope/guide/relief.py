@@ -153,7 +153,7 @@ def of_depth(depth: F32, projector: Projector, s: GuideSettings) -> Relief:
     normal = np.cross(_mean(along_u, size), _mean(along_v, size))
     with np.errstate(invalid="ignore", divide="ignore"):
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal *= np.where((normal * (origin.astype(np.float32) - xyz)).sum(-1, keepdims=True) < 0, -1, 1)
+    normal *= np.where((normal * rays).sum(-1, keepdims=True) > 0, -1, 1)
     away, beside = _beside(depth, max(middle / projector.lens.K[i, i] for i in (0, 1)))
     return Relief(projector, depth, steep, normal.astype(np.float32), area, away, beside, s.jump_mm)
 
