@@ -73,7 +73,7 @@ CONFINED = {
     "numba": {"kernels", "jit", "gpu"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "matplotlib": {"report", "evaluate"},
+    "matplotlib": {"report", "evaluate", "guide"},
     "embreex": {"twin"},
     "tifffile": {"store"},
     "pydantic": {"store", "server"},

@@ -49,6 +49,9 @@ def guide(
     if out.suffix.lower() != ".png":
         raise UsageError(f"--out {out}; needed the name of a PNG file, as pattern.png")
     existing(guidelines, "a file with guidelines")
+    record = out.with_name("pattern.json")
+    if record.exists() and record.samefile(guidelines):
+        raise UsageError(f"{guidelines} would be replaced by the record, pattern.json; choose another folder for --out")
     with Progress() as progress:
         asked = store.read_guidelines(guidelines)
         stored = progress.run("reading the scan", lambda: store.read_scan(scan))
@@ -84,7 +87,7 @@ def guide(
     with ExitStack() as files:
         beside = {camera: out.with_name(f"{out.stem}-{camera}.png") for camera in pictures}
         image = files.enter_context(store.new_file(out, force=force))
-        text = files.enter_context(store.new_file(out.with_suffix(".json"), force=force))
+        text = files.enter_context(store.new_file(record, force=force))
         views = {c: files.enter_context(store.new_file(p, force=force)) for c, p in beside.items()}
         store.write_png(image, made.image)
         store.write_json(text, doc)
