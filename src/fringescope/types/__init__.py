@@ -49,6 +49,7 @@ from fringescope.types.results import (
     WrappedSet,
 )
 from fringescope.types.rig import Camera, Lens, Pose, Projector, Rig, Volume, plane_size
+from fringescope.types.watching import CameraWatch, Motion, Standing, TileState, Watched, WatchTiles
 
 __all__ = [
     "F32",
@@ -62,6 +63,7 @@ __all__ = [
     "Bool",
     "Calibration",
     "Camera",
+    "CameraWatch",
     "Cloud",
     "Coverage",
     "Decoded",
@@ -78,6 +80,7 @@ __all__ = [
     "Layout",
     "LeftOut",
     "Lens",
+    "Motion",
     "NoiseModel",
     "Parameter",
     "PatternPlan",
@@ -97,12 +100,16 @@ __all__ = [
     "Scan",
     "Sighting",
     "Slice",
+    "Standing",
     "Surface",
     "SurfacePart",
+    "TileState",
     "ViewInput",
     "ViewPlan",
     "ViewVerdict",
     "Volume",
+    "WatchTiles",
+    "Watched",
     "WrappedSet",
     "plane_size",
 ]
