@@ -23,6 +23,7 @@ from fringescope.devices.base import (
     Shot,
     Shutter,
     Trigger,
+    TriggerSource,
 )
 from fringescope.errors import CaptureError, DeviceTimeoutError, IncompleteShotError, RejectedError
 from fringescope.settings import CaptureSettings
@@ -164,6 +165,47 @@ def photograph(
         if not frame.complete:
             raise IncompleteShotError(f"{c.info.uri}: the ring-light picture came incomplete; take it again")
     return tuple(f.pixels for f in frames)
+
+
+def look(
+    cameras: Sequence[Camera],
+    light: Light,
+    pixel_formats: Sequence[PixelFormat],
+    settings: CaptureSettings | None = None,
+) -> tuple[AnyArray, ...]:
+    """One raw frame of each camera under the ring light, triggered by software with the exposure of a scan, whatever
+    the projector shows meanwhile. The light is as bright afterwards as before.
+
+    Raises CaptureError unless there is a format for each camera, IncompleteShotError where a camera gives no frame or
+    a part of one, and what devices raise.
+    """
+    s = settings or CaptureSettings()
+    if len(cameras) != len(pixel_formats):
+        raise CaptureError(f"{len(cameras)} cameras for {len(pixel_formats)} pixel formats; needed one each")
+    for c, f in zip(cameras, pixel_formats, strict=True):
+        c.configure(CameraSettings(f, s.exposure_us + s.margin_us))
+    before = light.level
+    armed: list[Acquisition] = []
+    out = []
+    try:
+        light.set(1.0)
+        for c in cameras:
+            armed.append(c.arm(1, Trigger(TriggerSource.SOFTWARE, s.timeout_s)))
+        for a in armed:
+            a.trigger()
+        for c, a in zip(cameras, armed, strict=True):
+            try:
+                frame = next(iter(a))
+            except (DeviceTimeoutError, StopIteration) as e:
+                raise IncompleteShotError(f"{c.info.uri}: no picture came; check the camera and look again") from e
+            if not frame.complete:
+                raise IncompleteShotError(f"{c.info.uri}: the picture came incomplete; look again")
+            out.append(frame.pixels)
+    finally:
+        for a in armed:
+            a.cancel()
+        light.set(before)
+    return tuple(out)
 
 
 def label(key: FrameKey) -> str:

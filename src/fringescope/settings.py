@@ -250,6 +250,7 @@ class WatchSettings(_Section):
     levels: int = knob(3, "", "sizes of tiles, each twice the one before; the coarser ones also find larger shifts", "", 1, 6)
     tile_sigma_mm: float = knob(0.04, "mm", "a tile whose shift is less certain than this, for want of texture, has no vote", "", 0.001)
     floor_px: float = knob(0.03, "such pixels", "shifts below this are errors of the method, not of the noise", "", 0)
+    floor_depth_mm: float = knob(0.005, "mm", "changes of depth below this are errors of the method, not of the noise", "", 0)
     min_surface: float = knob(0.5, "", "share of a tile that must have points of the scan", "", 0, 1)
     min_texture: float = knob(0.05, "", "share of the surface whose texture must tell shifts; else SUSPECT", "", 0, 1)
     min_judged: float = knob(0.6, "", "share of that which must be seen again; else SUSPECT", "", 0, 1)

@@ -35,6 +35,7 @@ class WatchTiles:
 
     centre: F64  #: (n, 2) camera pixels (u, v)
     size: F64  #: (n,) side in camera pixels
+    width_mm: F64  #: (n,) side across the line of sight, mm
     shift_mm: F64  #: (n, 2) motion across the line of sight along u and v (a re-measurement: along it, and 0); NaN
     sigma_mm: F64  #: (n,) its standard deviation, along the direction that is known best
     p: F64  #: (n,) probability of such a shift by noise alone

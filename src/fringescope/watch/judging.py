@@ -25,6 +25,7 @@ from fringescope.watch.tracking import Tracked
 
 OVERLAP = 4  #: tiles of one level that hold the same pixel
 TOGETHER = 3  #: tiles that touch a shifted one and shifted alike, fewer than which do not make a motion
+FARTHEST = 0.4  #: sides of a tile; what went farther is not found by it
 ALIKE = 0.7  #: cosine between their directions
 OUTLIER = 12.0  #: squared sigmas from which a tile does not take part in the rigid motion
 PRIOR = np.array([20.0, 20.0, 20.0, 0.3, 0.3, 0.3])  #: mm and rad: no motion is larger; makes one camera's solvable
@@ -69,6 +70,7 @@ class _Votes:
     chi2: F64  #: (n,) of the shift, 2 degrees of freedom
     px: F64  #: (n, 2) shift in pixels of the comparison
     cov: F64  #: (n, 2, 2) of it
+    mm: F64  #: (n,) width of such a pixel across the line of sight
 
 
 def _votes(t: Tested, s: WatchSettings) -> _Votes:
@@ -103,8 +105,9 @@ def _votes(t: Tested, s: WatchSettings) -> _Votes:
     true = could & seen & (of("relief") > RELIEF)
     sigma = np.sqrt(np.maximum(values[:, 0], 0)) * mm
     return _Votes(
-        of("centre"), side, level, point, could, could & seen, fair, odd, true, kept * mm[:, None], sigma, chi2, shift, total
-    )
+        of("centre"), side, level, point, could, could & seen, fair, odd, true, kept * mm[:, None], sigma, chi2,
+        shift, total, mm,
+    )  # fmt: skip
 
 
 def verdict(tested: Sequence[Tested], s: WatchSettings) -> Watched:
@@ -117,17 +120,17 @@ def verdict(tested: Sequence[Tested], s: WatchSettings) -> Watched:
     cameras, states = [], {}
     for t in tested:
         if t.name not in every:
-            none = WatchTiles(np.zeros((0, 2)), *(np.zeros(0) for _ in range(1)), np.zeros((0, 2)), np.zeros(0),
-                              np.zeros(0), np.zeros(0, np.int8))  # fmt: skip
+            n0 = np.zeros(0)
+            none = WatchTiles(np.zeros((0, 2)), n0, n0, np.zeros((0, 2)), n0, n0, np.zeros(0, np.int8))
             why = t.why or "the scan has no surface there that fills a tile"
             cameras.append(CameraWatch(t.name, 0.0, None, 0.0, 0.0, t.gain, none, why))
             continue
         v = every[t.name]
         size = np.linalg.norm(v.shift, axis=1)
-        real = v.votes & v.true & (v.chi2 > limit) & (size > s.suspect_mm)
-        real &= _supported(v, real, alike=True) >= TOGETHER
+        real = v.votes & v.true & (v.chi2 > limit) & (size > s.suspect_mm) & (size < FARTHEST * v.side * v.mm)
+        real &= _supported(v, real) >= TOGETHER
         odd = v.odd & ~real
-        odd &= _supported(v, odd, alike=False) >= TOGETHER
+        odd &= touching(v.centre, float(v.side.min()), odd, None) >= TOGETHER
         state = np.where(v.votes, int(TileState.STILL), int(TileState.NO_VOTE)).astype(np.int8)
         state[real] = TileState.SHIFTED
         state[real & (size > s.stale_mm)] = TileState.MOVED
@@ -135,10 +138,10 @@ def verdict(tested: Sequence[Tested], s: WatchSettings) -> Watched:
         states[t.name] = state
         fine = v.level == 0
         could = max(int((v.could & fine).sum()), 1)
-        worst = int(np.argmax(np.where(real, size, -1)))
+        worst = int(np.argmax(np.where(real & (fine | ~(real & fine).any()), size, -1)))
         n = t.bin_
         tiles = WatchTiles(
-            (v.centre + 0.5) * n - 0.5, v.side * n, np.where(v.votes[:, None], v.shift, np.nan), v.sigma,
+            (v.centre + 0.5) * n - 0.5, v.side * n, v.side * v.mm, np.where(v.votes[:, None], v.shift, np.nan), v.sigma,
             np.exp(-v.chi2 / 2), state,
         )  # fmt: skip
         little = int((v.could & fine).sum()) < s.min_texture * int((np.isfinite(v.point[:, 0]) & fine).sum())
@@ -164,20 +167,30 @@ def verdict(tested: Sequence[Tested], s: WatchSettings) -> Watched:
     return Watched(standing, why, tuple(cameras), motion, p, judged)
 
 
-def _supported(v: _Votes, real: Bool, alike: bool) -> AnyArray:
-    """How many other such tiles (n,) of its level touch a tile; `alike`: that shifted in about the same direction, for
-    a film's highlights go each its own way.
+def touching(centre: F64, side: float, some: Bool, way: F64 | None) -> AnyArray:
+    """How many of the marked tiles (n,) of one size touch each of them; with `way` (n, 2), of those that went in about
+    the same direction, for a film's highlights go each its own way.
     """
     from scipy.spatial import cKDTree
 
+    out = np.zeros(len(some), np.intp)
+    k = np.flatnonzero(some)
+    if not k.size:
+        return out
+    pairs = cKDTree(centre[k]).query_pairs(1.01 * side, output_type="ndarray")
+    if way is not None:
+        unit = way[k] / np.maximum(np.linalg.norm(way[k], axis=1, keepdims=True), 1e-12)
+        pairs = pairs[(unit[pairs[:, 0]] * unit[pairs[:, 1]]).sum(1) > ALIKE]
+    out[k] = np.bincount(pairs.ravel(), minlength=k.size)
+    return out
+
+
+def _supported(v: _Votes, real: Bool) -> AnyArray:
+    """`touching`, level by level."""
     out = np.zeros(len(real), np.intp)
     for k in np.unique(v.level[real]):
-        some = np.flatnonzero(real & (v.level == k))
-        pairs = cKDTree(v.centre[some]).query_pairs(1.01 * float(v.side[some[0]]), output_type="ndarray")
-        if alike:
-            way = v.shift[some] / np.linalg.norm(v.shift[some], axis=1, keepdims=True)
-            pairs = pairs[(way[pairs[:, 0]] * way[pairs[:, 1]]).sum(1) > ALIKE]
-        out[some] = np.bincount(pairs.ravel(), minlength=some.size)
+        some = real & (v.level == k)
+        out[some] = touching(v.centre, float(v.side[some][0]), some, v.shift)[some]
     return out
 
 
@@ -201,7 +214,7 @@ def _judge(
     if far > s.stale_mm:
         return Standing.STALE, told
     if together >= TOGETHER and worst.shift_mm > s.stale_mm:
-        return Standing.STALE, f"part of it moved; {local}"
+        return Standing.STALE, f"{told}; most, {local}" if far > s.suspect_mm else f"part of it moved; {local}"
     if gone.changed > 0.5:
         return Standing.STALE, lost
     if far > s.suspect_mm:

@@ -7,8 +7,10 @@ together, and where it is larger than the limits in mm.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from fringescope import geometry
@@ -55,7 +57,8 @@ def compare(views: Sequence[View], rig: Rig, settings: WatchSettings | None = No
         raise CaptureError("no view to watch; needed the grid and the pictures of one camera at least")
     for v in views:
         _check(v)
-    tested = [_track(v, rig.camera(v.grid.camera), s) for v in views]
+    with ThreadPoolExecutor(len(views)) as pool:
+        tested = list(pool.map(lambda v: _track(v, rig.camera(v.grid.camera), s), views))
     return judging.verdict(tested, s)
 
 
@@ -125,18 +128,15 @@ def _why_not(now: AnyArray, fmt: PixelFormat) -> str:
 
 
 def _points(levels: Sequence[tracking.Tracked], xyz: AnyArray, valid: Bool, n: int) -> list[F64]:
-    """Per level the world points (k, 3) in the middle of each tile: means over its middle part, NaN where none is."""
+    """Per level the world points (k, 3) in the middle of each tile: means over its middle, NaN where none is."""
+    part = preparing.binned(valid.astype(np.float32), n)
+    where = np.where(valid[..., None], xyz, 0.0)
+    sums = [preparing.binned(where[..., i], n) for i in range(3)]
     out = []
-    H, W = valid.shape
     for t in levels:
-        points = np.full((len(t.centre), 3), np.nan)
-        half = max(1, int(t.side * n / 4))
-        step = max(1, half // 4)
-        for k, (u, v) in enumerate((t.centre + 0.5) * n - 0.5):
-            rows = slice(max(0, int(v) - half), min(H, int(v) + half + 1), step)
-            columns = slice(max(0, int(u) - half), min(W, int(u) + half + 1), step)
-            ok = valid[rows, columns]
-            if ok.any():
-                points[k] = xyz[rows, columns][ok].mean(0)
-        out.append(points)
+        side = max(3, int(t.side / 2) // 2 * 2 + 1)
+        u, v = np.rint(t.centre).astype(int).T
+        here = [cv2.boxFilter(a, -1, (side, side), borderType=cv2.BORDER_CONSTANT)[v, u] for a in (*sums, part)]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            out.append(np.stack(here[:3], 1).astype(np.float64) / np.where(here[3] > 1e-6, here[3], np.nan)[:, None])
     return out

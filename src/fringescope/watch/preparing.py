@@ -48,9 +48,9 @@ def grey(frame: AnyArray, fmt: PixelFormat) -> F32:
 
 def usable(frame: AnyArray, fmt: PixelFormat, mask: Bool | None) -> Bool:
     """Where (H, W) a frame is neither saturated nor masked."""
-    ok = frame < NEAR_FULL * fmt.max_value
-    ok = ok.all(2) if ok.ndim == 3 else ok
-    return np.asarray(ok if mask is None else ok & ~mask)
+    below = np.asarray(frame < NEAR_FULL * fmt.max_value)
+    ok = np.asarray(below.all(axis=2)) if below.ndim == 3 else below
+    return ok if mask is None else np.asarray(ok & ~mask)
 
 
 def binned(a: AnyArray, n: int) -> F32:
@@ -158,6 +158,7 @@ def pair(
         matched[rows, columns] = (b[rows, columns] - offset) / gain
     mean_gain = float(np.mean(factors))
     var = (noise.variance(a) + noise.variance(b) / mean_gain**2) / n**2
-    thin, fine = [binned(c, n) for c in (a, matched, var)], [binned(c, n) > 0.999 for c in ok]
-    fine = [o & ~highlights(smooth(c), o, s) for o, c in zip(fine, thin[:2], strict=True)]
-    return Pair(*thin, *fine, n, tuple(factors), tuple(offsets))
+    before, after, spread = (binned(c, n) for c in (a, matched, var))
+    fine = [binned(o, n) > 0.999 for o in ok]
+    fine = [np.asarray(o & ~highlights(smooth(c), o, s)) for o, c in zip(fine, (before, after), strict=True)]
+    return Pair(before, after, spread, fine[0], fine[1], n, tuple(factors), tuple(offsets))

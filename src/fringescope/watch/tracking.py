@@ -51,7 +51,7 @@ def track(p: Pair, surface: F32, s: WatchSettings) -> list[Tracked]:
             break
         for stack in (then, now, part):
             stack.append(_half(stack[-1]))
-        var.append(_half(var[-1]) / 4)
+        var.append(_half(var[-1]) * np.float32(0.25))
         for masks in (ok_a, ok_b):
             masks.append(_half(masks[-1].astype(np.float32)) > 0.7)
     out: list[Tracked] = []
@@ -108,10 +108,12 @@ def _level(
     B = np.stack([-again[0], -again[1], again[2] - mean, np.ones_like(ref), x, y], 1)
 
     tiles = _Tiles(A, B, w, ref, b, ok_b.astype(np.uint8), c0, r0, n)
-    own_cov = tiles.covariance(w)[0]
     e, at = tiles.look(np.zeros((count, 2)))
     first, _ = tiles.solve(e, at)
-    cov, structure = tiles.covariance(at)
+    own_cov, structure = tiles.covariance(w)
+    cov, hidden = own_cov.copy(), np.flatnonzero((at != w).any(1))
+    if hidden.size:
+        cov[hidden], structure[hidden] = tiles.pick(hidden).covariance(at[hidden])
     seen = (at > 0).mean(1) >= LEAST * np.clip(own[keep], LEAST, 1)
     texture = np.linalg.eigvalsh(structure) / (SLOPE_POWER * 0.5 * np.maximum((at > 0).sum(1), 1))[:, None]
     chi2_0 = np.einsum("ni,nij,nj->n", first[:, :2], np.linalg.inv(cov + 1e-9 * np.eye(2)), first[:, :2])
@@ -172,14 +174,15 @@ class _Tiles:
         Aw = self.A * at[:, None]
         H = (Aw @ self.A.transpose(0, 2, 1)).astype(np.float64)
         y = (Aw @ e[:, :, None])[..., 0].astype(np.float64)
-        return np.linalg.solve(_firm(H), y[..., None])[..., 0], H
+        return np.asarray(np.linalg.solve(_firm(H), y[..., None])[..., 0], np.float64), H
 
     def covariance(self, at: AnyArray) -> tuple[F64, F64]:
         """Of the shifts, by noise that was white before the smoothing, and the gradients' structure, (n, 2, 2)."""
         H = ((self.A * at[:, None]) @ self.A.transpose(0, 2, 1)).astype(np.float64)
         noise = ((self.B * at[:, None]) @ self.B.transpose(0, 2, 1)).astype(np.float64)
         inverse = np.linalg.inv(_firm(H))
-        return (inverse @ noise @ inverse)[:, :2, :2], np.linalg.inv(inverse[:, :2, :2] + 1e-12 * np.eye(2))
+        structure = np.linalg.inv(inverse[:, :2, :2] + 1e-12 * np.eye(2))
+        return np.asarray((inverse @ noise @ inverse)[:, :2, :2]), np.asarray(structure, np.float64)
 
     def search(self, d: F64, n: int) -> F64:
         """Gauss and Newton's steps from shifts d (n, 2); per tile the one that leaves least."""
