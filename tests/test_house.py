@@ -55,7 +55,10 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "store": (DATA, "files know data, not algorithms"),
     "importing": (DATA | {"store"}, "other people's images become one of our captures"),
     "export": (DATA, "files know data, not algorithms"),
-    "pipeline": (BOTTOM | STAGES | {"capture", "threads", "gpu"}, "all ordering lives here: objects, no files"),
+    "pipeline": (
+        BOTTOM | STAGES | {"capture", "devices.base", "threads", "gpu"},
+        "all ordering lives here: objects, no files",
+    ),
     "server": (ANYTHING, "the rim: nobody imports it"),
     "bench": (ANYTHING, "times the whole, for the command line alone"),
     "warmup": (ANYTHING, "a tiny scan from end to end, for the command line alone"),

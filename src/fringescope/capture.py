@@ -167,25 +167,46 @@ def photograph(
     return tuple(f.pixels for f in frames)
 
 
-def snapshots(
-    cameras: Sequence[Camera], pixel_formats: Sequence[PixelFormat], exposure_us: int, timeout_s: float = 5.0
+def look(
+    cameras: Sequence[Camera],
+    light: Light | None,
+    pixel_formats: Sequence[PixelFormat],
+    settings: CaptureSettings | None = None,
 ) -> tuple[AnyArray, ...]:
-    """One picture of each camera of what there is to see now, one after the other: raw frames (H, W).
+    """One raw frame of each camera, triggered by software with the exposure of a scan, whatever the projector shows
+    meanwhile; under the ring light, if it is given. The light is as bright afterwards as before.
 
-    Raises IncompleteShotError where none comes or it is not whole, RejectedError where a camera cannot.
+    Raises CaptureError unless there is a format for each camera, IncompleteShotError where a camera gives no frame or
+    a part of one, and what devices raise.
     """
-    out = []
+    s = settings or CaptureSettings()
+    if len(cameras) != len(pixel_formats):
+        raise CaptureError(f"{len(cameras)} cameras for {len(pixel_formats)} pixel formats; needed one each")
     for c, f in zip(cameras, pixel_formats, strict=True):
-        c.configure(CameraSettings(f, exposure_us))
-        with c.arm(1, Trigger(TriggerSource.SOFTWARE, timeout_s)) as acquisition:
-            acquisition.trigger()
+        c.configure(CameraSettings(f, s.exposure_us + s.margin_us))
+    before = light.level if light is not None else 0.0
+    armed: list[Acquisition] = []
+    out = []
+    try:
+        if light is not None:
+            light.set(1.0)
+        for c in cameras:
+            armed.append(c.arm(1, Trigger(TriggerSource.SOFTWARE, s.timeout_s)))
+        for a in armed:
+            a.trigger()
+        for c, a in zip(cameras, armed, strict=True):
             try:
-                frame = next(iter(acquisition))
+                frame = next(iter(a))
             except (DeviceTimeoutError, StopIteration) as e:
-                raise IncompleteShotError(f"{c.info.uri}: no picture came; check the camera and try again") from e
-        if not frame.complete:
-            raise IncompleteShotError(f"{c.info.uri}: the picture came incomplete; take it again")
-        out.append(frame.pixels)
+                raise IncompleteShotError(f"{c.info.uri}: no picture came; check the camera and look again") from e
+            if not frame.complete:
+                raise IncompleteShotError(f"{c.info.uri}: the picture came incomplete; look again")
+            out.append(frame.pixels)
+    finally:
+        for a in armed:
+            a.cancel()
+        if light is not None:
+            light.set(before)
     return tuple(out)
 
 

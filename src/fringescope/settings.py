@@ -237,6 +237,31 @@ class VerifySettings(_Section):
 
 
 @dataclass(frozen=True)
+class WatchSettings(_Section):
+    """Is the specimen still where it was scanned? (V-D)"""
+
+    suspect_mm: float = knob(0.10, "mm", "a shift across a camera's line of sight beyond this, that noise does not explain, is SUSPECT", "IV-D", 0.001)
+    stale_mm: float = knob(0.20, "mm", "and beyond this STALE", "IV-D", 0.001)
+    suspect_depth_mm: float = knob(0.05, "mm", "a change of depth beyond this, re-measured with fringes, is SUSPECT", "IV-D", 0.001)
+    stale_depth_mm: float = knob(0.10, "mm", "and beyond this STALE", "IV-D", 0.001)
+    false_alarm: float = knob(1e-3, "", "probability that noise alone raises an alarm, over all tiles and cameras of one look", "", 1e-9, 0.1)
+    pitch_mm: float = knob(0.15, "mm", "pictures are compared with pixels of about this width on the surface", "", 0.01)
+    tile: int = knob(16, "such pixels", "side of the smallest tile whose shift is measured", "", 8, 128)
+    levels: int = knob(3, "", "sizes of tiles, each twice the one before; the coarser ones also find larger shifts", "", 1, 6)
+    tile_sigma_mm: float = knob(0.04, "mm", "a tile whose shift is less certain than this, for want of texture, has no vote", "", 0.001)
+    floor_px: float = knob(0.03, "such pixels", "shifts below this are errors of the method, not of the noise", "", 0)
+    floor_depth_mm: float = knob(0.005, "mm", "changes of depth below this are errors of the method, not of the noise", "", 0)
+    min_surface: float = knob(0.5, "", "share of a tile that must have points of the scan", "", 0, 1)
+    min_texture: float = knob(0.05, "", "share of the surface whose texture must tell shifts; else SUSPECT", "", 0, 1)
+    min_judged: float = knob(0.6, "", "share of that which must be seen again; else SUSPECT", "", 0, 1)
+    max_light: float = knob(0.08, "", "places whose brightness changed by more than this share, against the whole picture's, and by max_light_factor times what is usual in it, are SUSPECT: covered, cut or pressed in", "", 0.001)
+    max_light_factor: float = knob(12.0, "", "see max_light: a film that dries changes a little everywhere", "", 1)
+    max_light_ever: float = knob(0.5, "", "a place that changed by more than this is never as it was scanned", "", 0.001)
+    max_gain: float = knob(1.6, "", "pictures brighter or darker than the scan's by more than this factor are of another light or exposure", "", 1.01)
+    bright: float = knob(0.3, "", "spots brighter than their surroundings by this share are highlights and do not vote", "", 0.01)
+
+
+@dataclass(frozen=True)
 class CaptureSettings(_Section):
     """Playing patterns and proving that frame n is pattern n."""
 
@@ -300,6 +325,7 @@ class Settings(_Section):
     verify: VerifySettings = field(default_factory=VerifySettings)
     guide: GuideSettings = field(default_factory=GuideSettings)
     loop: LoopSettings = field(default_factory=LoopSettings)
+    watch: WatchSettings = field(default_factory=WatchSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:

@@ -73,6 +73,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "timing",
         "Times a scan against a plain copy of the same memory and against other decoders, all in one run.",
     ),
+    "watch": (
+        "watching",
+        "Is the specimen still where it was scanned? VALID, SUSPECT or STALE, in one line with the reason.",
+    ),
     "warmup": ("timing", "Compiles the kernels for this processor now, so that no scan need; they are kept on disk."),
 }
 

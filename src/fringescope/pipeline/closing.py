@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def close_loop(guidance: Guidance, tissue: guide.Tissue, station: Station, setti
                 station.projector.dark()
             else:
                 station.projector.show(picture)
-            taken.append(capture.snapshots(cameras, formats, s.loop.exposure_us, s.capture.timeout_s))
+            taken.append(capture.look(cameras, None, formats, replace(s.capture, exposure_us=s.loop.exposure_us)))
     finally:
         station.projector.dark()
     shots = tuple(

@@ -18,6 +18,7 @@ from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_clou
 from fringescope.report.response import RippleCurve, response_picture
 from fringescope.report.sighting import sighting_picture
 from fringescope.report.story import VIEWPOINTS, around, story
+from fringescope.report.watching import watched_picture
 
 __all__ = [
     "DARK",
@@ -46,4 +47,5 @@ __all__ = [
     "response_picture",
     "sighting_picture",
     "story",
+    "watched_picture",
 ]

@@ -27,7 +27,7 @@ def sighting_picture(image: NDArray[Any], sighting: Sighting, residuals: Residua
     green). Green diamonds: white squares. Blue dots: phase samples. Red crosses: left out by the solve, where
     `residuals` are given; purple lines then show the corners' residuals, so much too long that they can be seen.
     """
-    grey = _grey(image)
+    grey = grey_picture(image)
     k = LONGEST / max(grey.shape)
     k = min(k, 1.0) if k < 1 else min(float(np.ceil(k)), 2.0)
     size = (max(1, round(grey.shape[1] * k)), max(1, round(grey.shape[0] * k)))
@@ -64,7 +64,8 @@ def _place(pixels: F64, k: float) -> F64:
     return np.asarray((pixels.reshape(-1, 2) + 0.5) * k - 0.5, dtype=np.float64)
 
 
-def _grey(image: NDArray[Any]) -> U8:
+def grey_picture(image: NDArray[Any]) -> U8:
+    """An image (H, W) or (H, W, 3) of any codes, mosaics too, as grey (H, W) that can be looked at."""
     a = np.nan_to_num(np.asarray(image, dtype=np.float32))
     if a.ndim == 3:
         a = a.mean(axis=2)

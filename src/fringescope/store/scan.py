@@ -21,7 +21,20 @@ from fringescope import __version__
 from fringescope.errors import CaptureError, FormatError
 from fringescope.store import files
 from fringescope.store.images import Images, write_png, write_tiff
-from fringescope.types import F32, U8, U16, Cloud, Decoded, Grid, Picture, PixelFormat, Reason, Scan, Surface
+from fringescope.types import (
+    F32,
+    U8,
+    U16,
+    Cloud,
+    Decoded,
+    Grid,
+    NoiseModel,
+    Picture,
+    PixelFormat,
+    Reason,
+    Scan,
+    Surface,
+)
 
 FORMAT, VERSION = "fringescope-scan", 1
 DECODED_FORMAT, DECODED_VERSION = "fringescope-decoded", 1
@@ -59,6 +72,31 @@ class StoredScan:
         """The URI of the instrument that took it, where the scan tells it."""
         told = self.document.get("instrument")
         return told if isinstance(told, str) else None
+
+    def noise(self) -> dict[str, NoiseModel]:
+        """Of one raw sample, by camera, where the scan tells it."""
+        out = {}
+        for camera, v in self._figures().items():
+            told = v.get("noise")
+            a, b = (told.get("a"), told.get("b")) if isinstance(told, dict) else (None, None)
+            if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+                out[camera] = NoiseModel(float(a), float(b), "scan.json")
+        return out
+
+    def gradients(self) -> dict[str, tuple[tuple[float, float], ...]]:
+        """Of the finest fringes of each direction, cycles per projector-plane unit, by camera."""
+        out = {}
+        for camera, v in self._figures().items():
+            told = v.get("directions")
+            pairs = [g for g in told if isinstance(g, list) and len(g) == 2] if isinstance(told, list) else []
+            if pairs and all(isinstance(x, (int, float)) for g in pairs for x in g):
+                out[camera] = tuple((float(a), float(b)) for a, b in pairs)
+        return out
+
+    def _figures(self) -> dict[str, dict[str, Any]]:
+        figures = self.document.get("figures")
+        views = figures.get("views") if isinstance(figures, dict) else None
+        return {c: v for c, v in views.items() if isinstance(v, dict)} if isinstance(views, dict) else {}
 
     def every_picture(self) -> tuple[Picture, ...]:
         """The photograph of each grid. Raises FormatError where the scan keeps none."""

@@ -62,6 +62,7 @@ from fringescope.types.results import (
     WrappedSet,
 )
 from fringescope.types.rig import Camera, Lens, Pose, Projector, Rig, Volume, plane_size
+from fringescope.types.watching import CameraWatch, Motion, Standing, TileState, Watched, WatchTiles
 
 __all__ = [
     "F32",
@@ -75,6 +76,7 @@ __all__ = [
     "Bool",
     "Calibration",
     "Camera",
+    "CameraWatch",
     "Cloud",
     "Coverage",
     "Decoded",
@@ -98,6 +100,7 @@ __all__ = [
     "Layout",
     "LeftOut",
     "Lens",
+    "Motion",
     "NoiseModel",
     "Parameter",
     "PatternPlan",
@@ -118,15 +121,19 @@ __all__ = [
     "Side",
     "Sighting",
     "Slice",
+    "Standing",
     "Stroke",
     "StrokeKind",
     "Surface",
     "SurfacePart",
+    "TileState",
     "Trace",
     "ViewInput",
     "ViewPlan",
     "ViewVerdict",
     "Volume",
+    "WatchTiles",
+    "Watched",
     "WrappedSet",
     "plane_size",
 ]
