@@ -1,7 +1,8 @@
 """The owner of a watchdog, for tests: guards the simulated projector and does what it is told, a line at a time.
 
-With `light` it guards a projector without a world to look at, which is there sooner. Commands: `guard` (starts a guard, shows a picture, beats), `hush` (stops beating), `hang` (holds the interpreter for a
-second), `end` (closes the guard), `quit`. Each is answered by one line of JSON.
+With `light` it guards a projector without a world to look at, which is there sooner. Commands: `guard` (starts a guard,
+shows a picture, beats), `hush` (stops beating), `hang` (holds the interpreter for a second), `end` (closes the guard),
+`quit`. Each is answered by one line of JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Lamp(VirtualProjector):
     """Holds pictures as the simulated projector does, and plays nothing."""
 
     def _play(self, loaded: LoadedShot) -> Running:
-        raise DeviceLostError("it plays nothing")
+        raise DeviceLostError(f"a shot of {len(loaded.shot.patterns)}; it plays nothing")
 
 
 def hold_the_interpreter(seconds: float) -> None:
