@@ -263,7 +263,7 @@ class GuardSettings(_Section):
     """The watchdog that turns the projector dark (IV-D)."""
 
     beat_ms: float = knob(10.0, "ms", "from one sign of life to the next, each way", "", 1, 40)
-    deadline_ms: float = knob(50.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
+    deadline_ms: float = knob(40.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
     lease_s: float = knob(2.0, "s", "for so long at most the owner lets a thread beat for it while it is busy", "", 0.02, 60)
     start_s: float = knob(20.0, "s", "the watchdog must be ready in this time", "", 0.1, 600)
 

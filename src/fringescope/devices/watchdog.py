@@ -20,6 +20,7 @@ import gc
 import importlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -290,12 +291,21 @@ class _Pipe:
     """What came through the owner's pipe, read by a thread of its own: not every system waits for pipes otherwise."""
 
     def __init__(self, number: int) -> None:
+        self._number = number
         self.beat_ns, self.gone, self.quit = time.monotonic_ns(), False, False
         self.news = threading.Event()
-        threading.Thread(target=self._read, args=(number,), daemon=True).start()
+        threading.Thread(target=self._read, daemon=True).start()
 
-    def _read(self, number: int) -> None:
-        while data := _read(number):
+    def unread(self) -> bool:
+        """Whether something lies in the pipe that the thread has not read yet."""
+        if sys.platform == "win32":  # only sockets can be asked there: let the thread run instead
+            before = self.beat_ns
+            time.sleep(_LOOK_AGAIN_S)
+            return self.beat_ns != before
+        return bool(select.select([self._number], [], [], 0)[0]) and not self.gone
+
+    def _read(self) -> None:
+        while data := _read(self._number):
             self.beat_ns = time.monotonic_ns()
             if _QUIT in data:
                 self.quit = True
@@ -342,7 +352,8 @@ def _reason(switch: KillSwitch, pipe: _Pipe, deadline_ms: float) -> str:
         return "the watchdog's owner is gone"
     if pipe.quit or time.monotonic_ns() - pipe.beat_ns <= deadline_ms * _MS:
         return ""
-    time.sleep(_LOOK_AGAIN_S)  # let the reading thread run
+    if pipe.unread():
+        return ""  # kept from the processor, and so was the thread that reads
     silent_ms = (time.monotonic_ns() - pipe.beat_ns) / _MS
     return f"no heartbeat for {silent_ms:.0f} ms" if silent_ms > deadline_ms and not pipe.quit else ""
 

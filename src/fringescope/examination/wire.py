@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
@@ -34,7 +35,7 @@ def from_dict(d: object) -> Any:
     if not isinstance(d, dict) or not isinstance(kind, str) or kind not in _KINDS:
         raise FormatError(f"kind {str(kind)[:40]!r}; needed one of {', '.join(sorted(_KINDS))}")
     cls = _KINDS[kind]
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     found: dict[str, Any] = {}
     for f in dataclasses.fields(cls):
         if f.name in d:
@@ -42,6 +43,11 @@ def from_dict(d: object) -> Any:
         elif f.default is dataclasses.MISSING:
             raise FormatError(f"{kind} without '{f.name}'")
     return cls(**found)
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
 
 
 def _plain(value: Any) -> Any:
