@@ -50,12 +50,12 @@ class Owner:
         self.process.stdin.flush()
         return json.loads(self.process.stdout.readline())
 
-    def guard(self) -> None:
+    def guard(self) -> bool:
+        """Whether a picture is shown now: a machine that is busy enough may lose its guard before anything happens."""
         answer = self.say("guard")
-        assert answer["shown"]
         self.watchdog = answer["watchdog"]
         self.button = pickle.loads(bytes.fromhex(answer["button"]))
-        assert self.button.switch.state is None
+        return bool(answer["shown"]) and self.button.switch.state is None
 
     def seen_dark(self) -> int:
         """When this process saw that the lamp is cut, ns."""
@@ -194,9 +194,9 @@ def measured(fate: str, owners: Owners, times: int, record: Record) -> list[floa
     early = 0  # dark before anything happened: safe, and a nuisance
     while len(out) < times:
         o = owners.one()
-        o.guard()
+        shown = o.guard()
         time.sleep(0.03 + 0.02 * np.random.default_rng(len(out)).random())
-        if o.button.switch.state is not None:
+        if not shown or o.button.switch.state is not None:
             early += 1
             assert early <= 1 + times // 4
             continue
@@ -238,7 +238,7 @@ def test_it_is_dark_in_time_a_hundred_times(
 
 
 def test_who_beats_stays_lit_and_who_is_done_ends_in_the_dark(owner: Owner) -> None:
-    owner.guard()
+    assert owner.guard()
     for _ in range(8):
         time.sleep(0.25)
         assert owner.say("state")["shown"]
@@ -247,7 +247,7 @@ def test_who_beats_stays_lit_and_who_is_done_ends_in_the_dark(owner: Owner) -> N
 
 
 def test_an_owner_that_holds_the_interpreter_is_lost(owner: Owner) -> None:
-    owner.guard()
+    assert owner.guard()
     answer = owner.say("hang")
     assert not answer["shown"]
     assert answer["lost"]
@@ -449,7 +449,7 @@ def test_a_device_that_does_not_answer_is_tried_again(station: Station) -> None:
 
 
 def test_nothing_is_left_behind(owner: Owner) -> None:
-    owner.guard()
+    assert owner.guard()
     path = Path(owner.button.switch.path)
     assert path.exists()
     owner.process.kill()

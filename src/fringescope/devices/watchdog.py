@@ -292,7 +292,7 @@ class _Pipe:
 
     def __init__(self, number: int) -> None:
         self._number = number
-        self.beat_ns, self.gone, self.quit = time.monotonic_ns(), False, False
+        self.beat_ns, self.gone, self.quit = 0, False, False  #: no beat yet: nothing is shown yet
         self.news = threading.Event()
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -350,7 +350,7 @@ def _reason(switch: KillSwitch, pipe: _Pipe, deadline_ms: float) -> str:
         return asked.why
     if pipe.gone and not pipe.quit:
         return "the watchdog's owner is gone"
-    if pipe.quit or time.monotonic_ns() - pipe.beat_ns <= deadline_ms * _MS:
+    if pipe.quit or not pipe.beat_ns or time.monotonic_ns() - pipe.beat_ns <= deadline_ms * _MS:
         return ""
     if pipe.unread():
         return ""  # kept from the processor, and so was the thread that reads
