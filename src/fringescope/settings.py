@@ -306,6 +306,23 @@ class LoopSettings(_Section):
     max_height_mm: float = knob(0.15, "mm", "lines that lie farther off the scanned surface say that it has changed", "", 0)
     accept_um: float = knob(150.0, "um", "guidance whose lines land farther than this from the asked ones (p95) is not as it should be", "", 1)
     exposure_us: int = knob(16000, "us", "exposure of the pictures in which lines are looked for", "", 10, 10_000_000)
+class ExaminationSettings(_Section):
+    """When a guideline may be projected, and for how long without a word (IV-D)."""
+
+    verdict_s: float = knob(5.0, "s", "nothing is projected on a specimen that nobody has looked at for so long", "", 0.05, 3600)
+    suspect_s: float = knob(10.0, "s", "dashed lines on a suspect specimen go out if the operator does not say in this time to go on", "", 0, 3600)
+    arm_s: float = knob(60.0, "s", "what is armed and not started for so long must be armed again", "", 1, 3600)
+    max_strokes: int = knob(500, "strokes", "strokes in one author's draft at most", "", 1, 100_000)
+
+
+@dataclass(frozen=True)
+class GuardSettings(_Section):
+    """The watchdog that turns the projector dark (IV-D)."""
+
+    beat_ms: float = knob(10.0, "ms", "from one sign of life to the next, each way", "", 1, 40)
+    deadline_ms: float = knob(40.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
+    lease_s: float = knob(2.0, "s", "for so long at most the owner lets a thread beat for it while it is busy", "", 0.02, 60)
+    start_s: float = knob(20.0, "s", "the watchdog must be ready in this time", "", 0.1, 600)
 
 
 @dataclass(frozen=True)
@@ -326,6 +343,8 @@ class Settings(_Section):
     guide: GuideSettings = field(default_factory=GuideSettings)
     loop: LoopSettings = field(default_factory=LoopSettings)
     watch: WatchSettings = field(default_factory=WatchSettings)
+    examination: ExaminationSettings = field(default_factory=ExaminationSettings)
+    guard: GuardSettings = field(default_factory=GuardSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:
