@@ -29,6 +29,10 @@ class CalibrationError(FringescopeError):
     """Board pictures that do not make a rig: no board, too few or too similar poses, another board than described."""
 
 
+class RegistrationError(FringescopeError):
+    """Two surfaces that cannot be laid on each other: other specimens, bent, moved too far, other instruments."""
+
+
 class EmptyResultError(FringescopeError):
     """Nothing was left to return, for a reason that the message states."""
 

@@ -60,6 +60,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "scanning",
         "A scan in other people's formats: the surface (stl, obj, 3mf, glb) or the points (pcd, e57, ply), in mm.",
     ),
+    "compare": (
+        "comparing",
+        "Two scans, before and after a cut: what was removed, where, how surely, and how far from the guideline.",
+    ),
     "demo": (
         "showing",
         "The simulated instrument scans a wet specimen: capture, scan, error map against the truth, "

@@ -12,6 +12,7 @@ from fringescope.store.capture import (
     view_inputs,
     write_capture,
 )
+from fringescope.store.comparison import check_pair, put_comparison, read_strokes
 from fringescope.store.files import new_file, new_folder, write_json
 from fringescope.store.images import Images, write_png, write_tiff
 from fringescope.store.response import read_response, response_document
@@ -46,6 +47,7 @@ __all__ = [
     "StoredScan",
     "board_document",
     "calibration_document",
+    "check_pair",
     "check_rig",
     "hash_capture",
     "hash_rig",
@@ -55,6 +57,7 @@ __all__ = [
     "parse_board",
     "plain",
     "put_capture",
+    "put_comparison",
     "put_decoded",
     "put_patterns",
     "put_scan",
@@ -65,6 +68,7 @@ __all__ = [
     "read_rig",
     "read_scan",
     "read_session",
+    "read_strokes",
     "response_document",
     "rig_document",
     "spooled",
