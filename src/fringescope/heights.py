@@ -187,10 +187,11 @@ def pieces(mask: Bool) -> tuple[int, AnyArray, AnyArray]:
     return n - 1, labels, stats[:, cv2.CC_STAT_AREA]
 
 
-def outline(where: Layout, height: F64, inside: Bool, level: float) -> F64:
+def outline(where: Layout, height: F64, inside: Bool, level: float, steep: float | None = None) -> F64:
     """Places (n, 2) between cells inside and their neighbours outside where the height crosses `level`.
 
-    Halfway where the heights do not say.
+    Halfway where the heights do not say. Where they differ by more than a cell's side the cell inside straddles a wall:
+    then, if `steep` is given, that share of the way to the neighbour (below 0: back into the cell).
     """
     found = []
     h, w = inside.shape
@@ -200,6 +201,8 @@ def outline(where: Layout, height: F64, inside: Bool, level: float) -> F64:
         za, zb = height[i, j] - level, height[i + di, j + dj] - level
         with np.errstate(invalid="ignore", divide="ignore"):
             t = np.where(za * zb < 0, za / (za - zb), 0.5)
+        if steep is not None:
+            t = np.where(np.abs(za - zb) > where.cell_mm, np.where(inside[i, j], steep, 1 - steep), t)
         found.append(where.low + where.cell_mm * np.stack([j + t * dj, i + t * di], 1))
     return np.concatenate(found)
 

@@ -152,7 +152,7 @@ class _Pair:
         if ok.sum() < 30:
             return pose, 0.0
         J, r, sigma = self.jacobian(p[ok], m[ok]), r[ok], sigma[ok]
-        scale = max(1.4826 * float(np.median(np.abs(r))), least)
+        scale = max(float(np.quantile(np.abs(r), 0.3)) / 0.3853, least)  # from what fits best: the rest may be cut
         w = _tukey(r / np.hypot(_TUKEY * scale, 3 * sigma)) / sigma**2
         H = (J * w[:, None]).T @ J
         values, vectors = np.linalg.eigh(H)
@@ -205,6 +205,25 @@ class _Pair:
             now = self.cost(few, pose)
             if now < 0.7 * cost:
                 best, cost = pose, now
+        return (best, steps) if cost < s.plain_mm else self.by_parts(few, best, cost, steps, x, y)
+
+    def by_parts(self, few: Patch, best: Pose, cost: float, steps: int, x: F64, y: F64) -> tuple[Pose, int]:
+        """Where one side was cut away, all of it fits best with a lean that fits nowhere: each part is tried alone."""
+        some = self.old.only(_spread(self.old.xyz, 4 * _COARSE))
+        a, b = (some.xyz - self.c) @ x, (some.xyz - self.c) @ y
+        parts = [a > 0, a < 0, b > 0, b < 0, (a > 0) & (b > 0), (a > 0) & (b < 0), (a < 0) & (b > 0), (a < 0) & (b < 0)]
+        begun, least = best, 0.7 * cost
+        for part in parts:
+            if part.sum() < 60:
+                continue
+            pose, n = self.settled(some.only(part), begun, self.s.max_shift_mm / 2, 12)
+            pose, m = self.settled(few, pose, 1.0, 6)
+            steps += n + m
+            now = self.cost(few, pose)
+            if now < least:
+                best, least = pose, now
+                if now < self.s.plain_mm:
+                    break
         return best, steps
 
     def settled(self, few: Patch, pose: Pose, reach: float, rounds: int) -> tuple[Pose, int]:
@@ -216,10 +235,10 @@ class _Pair:
         return pose, rounds
 
     def cost(self, few: Patch, pose: Pose) -> float:
-        """How far the nearest 65 % of the points are from the other surface along the normal, mm."""
+        """How far the nearest half of the points are from the other surface along the normal, mm."""
         _, _, r, _, ok = self.pairs(few, pose, 3.0)
         away = np.sort(np.where(ok, np.abs(r), 3.0))
-        return float(away[: max(1, int(0.65 * len(away)))].mean())
+        return float(away[: max(1, int(0.5 * len(away)))].mean())
 
     def fine(self, pose: Pose) -> tuple[Pose, int, bool]:
         """Steps on many points until they are nothing."""
@@ -320,8 +339,7 @@ def _loose_words(loose: F64, lever: float) -> tuple[str, ...]:
     if k == 0:
         return ()
     turns, shifts = (loose[:3] ** 2).sum(0), (loose[3:] ** 2).sum(0)
-    free_shifts = int(np.linalg.matrix_rank(loose[3:], tol=0.35))
-    if k == 3 and free_shifts == 2 and turns.sum() < 1.6:
+    if k == 3 and np.linalg.svd(loose[:3], compute_uv=False)[1] < 0.1:  # one turn, and shifts without a turn
         return ("the surface is nearly a plane: shifts along it and turns about its normal are not told by it",)
     if k == 3:
         return ("the surface is nearly a sphere: turns about its middle are not told by it",)

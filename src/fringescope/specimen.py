@@ -243,7 +243,7 @@ def _piece(plane: Substrate, hm: HeightMap, tops: tuple[F64, F64], mask: Bool, f
     mask = np.asarray(cv2.morphologyEx(_without_holes(mask).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3)))) > 0
     h = np.where(mask, np.maximum(full, 0), 0.0)
     unseen = mask & ~hm.seen
-    rim = heights.outline(where, full, mask, low)
+    rim = heights.outline(where, full, mask, low, steep=-0.25)  # of cells that straddle a wall the outermost ones count
     (_, (side_a, side_b), _) = cv2.minAreaRect(rim.astype(np.float32))
     edge = mask & ~np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     perimeter = cell * 0.8 * len(rim)
@@ -255,15 +255,15 @@ def _piece(plane: Substrate, hm: HeightMap, tops: tuple[F64, F64], mask: Bool, f
     g = a * np.array([mask.sum(), x[mask].sum(), y[mask].sum()])
     holes = a * float(doubt[mask].sum())  # what hides, hides alike: these add up
     random = a * math.sqrt(float((hm.sigma[mask & hm.seen] ** 2).sum()))
-    walls = 0.3 * a * math.sqrt(float((h[edge] ** 2).sum()))
+    walls = 0.25 * a * float(h[edge].sum())  # which way a cell on the border falls depends on its flank
     tilt = math.sqrt(max(float(g @ plane.covariance @ g), 0.0))
     volume = float(h.sum()) * a + foot * low / 2
     volume_sigma = math.sqrt(random**2 + walls**2 + tilt**2 + holes**2 + (foot * low / 2) ** 2)
     on_edge = 0.3 * a * math.sqrt(max(float(edge.sum()), 1.0))
     hidden = float((unseen & edge).sum()) * a
-    blur = 0.25 * cell * perimeter  # which way a cell on the border falls depends on its flank
+    blur = 0.25 * cell * perimeter
     area_sigma = math.sqrt(on_edge**2 + (foot / 2) ** 2 + hidden**2 + blur**2)
-    side_sigma = math.hypot(0.41 * cell, foot / max(perimeter, cell))
+    side_sigma = math.hypot(0.5 * cell, foot / max(perimeter, cell))
     top, peak, at = _top(hm, mask)
     here = np.array([1.0, x[at], y[at]])
     noise = math.hypot(float(np.nan_to_num(hm.sigma[at])), 0.5 * cell * float(np.nan_to_num(hm.slope[at])))

@@ -268,7 +268,7 @@ def _regions(
         error.append(part)
         if region.removed:
             width = region.width_mm if region.kerf else None
-            cuts.append(cut_line(width, mine, frame, where, smooth, limit, full_a, full_b, domain, grounded))
+            cuts.append(cut_line(width, mine, frame, where, smooth, limit, full_a, domain, grounded))
     independent = np.array([e[0] for e in error])
     together = np.array([e[1] for e in error]).reshape(-1, 6)
 

@@ -10,11 +10,12 @@ from fringescope.heights import Frame, Layout
 from fringescope.types import F64, Bool
 
 _MOST_CUT = 4000  #: points of a cut at most
+EDGE_MM = 1.5  #: so near to the specimen's own edge a rim is not the cut's
+HOLE_MM2 = 10.0  #: smaller unchanged places within a cut have no rim
 
 
 def cut_line(
-    width_mm: float | None, core: Bool, frame: Frame, where: Layout, smooth: F64, limit: F64, full_a: F64, full_b: F64,
-    domain: Bool, grounded: bool,
+    width_mm: float | None, core: Bool, frame: Frame, where: Layout, smooth: F64, limit: F64, full_a: F64, domain: Bool, grounded: bool,
 ) -> F64:  # fmt: skip
     """Where a cut ran, (n, 3) world mm on the first surface: the centre line of a kerf of `width_mm`, else the rim.
 
@@ -24,18 +25,30 @@ def cut_line(
     if width_mm is not None:
         xy = _centre_line(where, core, smooth, max(width_mm, 2 * where.cell_mm))
     else:
-        level = float(np.median(limit[core]))
-        xy = heights.outline(where, smooth, core, level)
+        square = np.ones((5, 5), np.uint8)
+        deep = cv2.dilate(np.where(core, smooth, 0.0), square)
+        wall = deep > limit + 2 * where.cell_mm  # steeper than 45 degrees
+        level = np.where(wall, np.maximum(limit, 0.5 * deep), limit)  # half way down a wall
+        border = cv2.erode(core.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0
+        core = _without_small_holes(core & ~(border & (smooth < level)), HOLE_MM2 / where.area_mm2)
+        xy = heights.outline(where, smooth - level, core, 0.0)
         ij = np.rint((xy - where.low) / where.cell_mm).astype(int)
-        around = np.asarray(cv2.dilate(core.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~core & domain
-        if grounded:  # the specimen's own edge is no cut: beyond it there must be specimen still
-            around &= full_b > 0.1
+        around = np.asarray(cv2.dilate(core.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0) & ~core & domain
+        if grounded:  # the specimen's own edge is no cut
+            n = 2 * max(1, round(EDGE_MM / where.cell_mm)) + 1
+            around &= cv2.erode((domain & (full_a > 0.1)).astype(np.uint8), np.ones((n, n), np.uint8)) > 0
         beside = np.asarray(cv2.dilate(around.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
         h, w = where.shape
         xy = xy[beside[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]]
     step = max(1, len(xy) // _MOST_CUT)
     xy = xy[::step]
     return frame.world(np.column_stack([xy, sampled(full_a, where, xy)]))
+
+
+def _without_small_holes(core: Bool, cells: float) -> Bool:
+    n, labels, area = heights.pieces(~core)
+    small = np.flatnonzero(area[1:] < cells) + 1 if n else np.zeros(0, np.int64)
+    return np.asarray(core | np.isin(labels, small))
 
 
 def sampled(values: F64, where: Layout, xy: F64) -> F64:
