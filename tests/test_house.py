@@ -27,10 +27,10 @@ DOCS = ROOT / "docs"
 # ------------------------------------------------------------------------------------------------ who may import whom
 
 DATA = {"types", "settings", "errors"}
-BOTTOM = DATA | {"geometry", "kernels", "memory", "calm"}
+BOTTOM = DATA | {"geometry", "kernels", "memory", "calm", "heights"}
 STAGES = {
     "patterns", "phase", "denoise", "triangulate", "fuse", "response", "guide", "calibrate", "evaluate", "compare",
-    "watch", "examination", "report",
+    "watch", "examination", "report", "register", "specimen",
 }  # fmt: skip
 ANYTHING = {"*"}
 
@@ -46,6 +46,7 @@ MAY_IMPORT: dict[str, tuple[set[str], str]] = {
     "kernels": ({"threads", "jit"}, "arrays in, arrays out: they know no dataclass, file or device"),
     "geometry": (DATA | {"kernels"}, "poses and lenses on top of the lens kernels"),
     "calm": (DATA | {"kernels", "threads", "memory"}, "tiles of an image that need no closer look, for any stage"),
+    "heights": (DATA, "maps of height over a plane, for any stage"),
     **dict.fromkeys(STAGES, (BOTTOM, "stages never import each other: what passes between them is a type")),
     "twin": (DATA | {"threads", "jit"}, "the judge shares no maths with the judged"),
     "devices": (DATA, "a device knows what it is asked, not who asks"),

@@ -323,6 +323,50 @@ class GuardSettings(_Section):
     deadline_ms: float = knob(40.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
     lease_s: float = knob(2.0, "s", "for so long at most the owner lets a thread beat for it while it is busy", "", 0.02, 60)
     start_s: float = knob(20.0, "s", "the watchdog must be ready in this time", "", 0.1, 600)
+class SpecimenSettings(_Section):
+    """The specimen told from its substrate, and its size."""
+
+    flat_mm: float = knob(0.05, "mm", "points this near to a plane lie on it, or within four sigma, if that is more", "", 0.001)
+    min_substrate: float = knob(0.02, "", "share of the points that must lie on a plane for it to be the substrate", "", 0.001, 1)
+    min_span: float = knob(0.15, "", "share of the field, each way, over which they must be spread", "", 0, 1)
+    max_below: float = knob(0.01, "", "share of the points that may lie below the substrate", "", 0, 0.5)
+    peak: float = knob(3.0, "", "points on the substrate over those in a band of the same width just above it: fewer are no plane", "", 0)
+    max_tilt_deg: float = knob(40.0, "deg", "the substrate may lean so far against the projector's axis", "", 0, 80)
+    low_mm: float = knob(0.06, "mm", "what is higher than this above the substrate, or than six standard deviations of it, may be specimen", "", 0.001)
+    high_mm: float = knob(0.3, "mm", "a specimen is somewhere at least so high", "", 0.001)
+    min_area_mm2: float = knob(8.0, "mm^2", "smaller pieces are crumbs", "", 0)
+    hole_mm: float = knob(6.0, "mm", "gaps at the border of the field narrower than this are holes of it", "", 0)
+    least_cell_mm: float = knob(0.15, "mm", "least side of the cells in which heights are taken", "", 0.005)
+    max_points: int = knob(120_000, "", "points that are looked at; more do not make it better", "", 1000)
+
+
+@dataclass(frozen=True)
+class RegisterSettings(_Section):
+    """One scan's surface laid on another's."""
+
+    max_shift_mm: float = knob(6.0, "mm", "a surface that has moved farther is not followed", "", 0.1, 100)
+    max_turn_deg: float = knob(6.0, "deg", "nor one that has turned by more", "", 0.1, 45)
+    min_inliers: float = knob(0.55, "", "least share of the surface that must fit within inlier_mm: less is another specimen, or bent", "", 0.1, 1)
+    inlier_mm: float = knob(0.08, "mm", "what fits lies this near to the other surface along the normal, or within four sigma (up to three times this)", "", 0.001)
+    floor_mm: float = knob(0.003, "mm", "error of a point beside its own noise (sampling, calibration) by which pairs are weighed", "", 0)
+    plain_mm: float = knob(0.03, "mm", "surfaces that meet this well without being searched for are not searched for elsewhere", "", 0)
+    loose_share: float = knob(0.002, "", "a motion that the surface tells less than this, of what it tells best, is not told: 0.002 is a slope of 2.6 degrees", "", 1e-9, 0.5)
+    rounds: int = knob(40, "", "steps on all points at most", "", 3)
+
+
+@dataclass(frozen=True)
+class CompareSettings(_Section):
+    """What changed between two scans."""
+
+    sigma: float = knob(4.0, "sigma", "a change counts where it exceeds this, of noise, registration and what unchanged places show", "", 1)
+    least_mm: float = knob(0.03, "mm", "and this", "", 0)
+    min_area_mm2: float = knob(2.0, "mm^2", "smaller changes are crumbs", "", 0)
+    margin_mm: float = knob(0.5, "mm", "the volume of a change is taken so far around it, where it falls below what counts", "", 0)
+    patch_mm: float = knob(5.0, "mm", "errors of unchanged places farther apart than this are independent", "", 0.1)
+    kerf_mm: float = knob(5.0, "mm", "a narrower and long removed region is a kerf: its centre line is the cut; else its rim is", "", 0)
+    max_depth_mm: float = knob(40.0, "mm", "a deeper change is none: something else lies there", "", 0.1)
+    min_common: float = knob(0.3, "", "share of the first surface that must be seen again", "", 0, 1)
+    max_points: int = knob(1_000_000, "", "points of each surface that are looked at", "", 1000)
 
 
 @dataclass(frozen=True)
@@ -345,6 +389,9 @@ class Settings(_Section):
     watch: WatchSettings = field(default_factory=WatchSettings)
     examination: ExaminationSettings = field(default_factory=ExaminationSettings)
     guard: GuardSettings = field(default_factory=GuardSettings)
+    specimen: SpecimenSettings = field(default_factory=SpecimenSettings)
+    register: RegisterSettings = field(default_factory=RegisterSettings)
+    compare: CompareSettings = field(default_factory=CompareSettings)
 
 
 def to_dict(s: Settings) -> dict[str, Any]:

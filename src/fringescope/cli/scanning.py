@@ -117,6 +117,10 @@ def scan_summary(doc: dict[str, Any], out: Path) -> list[str]:
     lines = [f"{out}: {doc['cloud']['points']} points" + (f", {surface['triangles']} triangles" if surface else "")]
     if isinstance(why := doc["figures"].get("surface"), str):
         lines.append(why)
+    if isinstance(found := doc["figures"].get("specimen"), dict):
+        from fringescope import specimen
+
+        lines.append(specimen.words(found))
     for v in doc["views"]:
         lines += list(v.get("words", ()))
     return lines

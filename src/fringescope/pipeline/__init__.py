@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fringescope import denoise, fuse, geometry, phase, response, triangulate
+from fringescope import denoise, fuse, geometry, phase, response, specimen, triangulate
 from fringescope.errors import CalibrationError, CaptureError, EmptyResultError, UsageError
 from fringescope.pipeline import arrival, coarse, fast, pictures
 from fringescope.pipeline.fast import Device
@@ -428,6 +428,10 @@ def scan(
     cloud = fuse.cloud(fused)
     every = fuse.all_points(grids, photos, rig, s.fuse) if all_points else None
     times["fuse"] = perf_counter() - start
+    start = perf_counter()
+    found = specimen.find(cloud.xyz, cloud.normals, cloud.sigma, -rig.projector.pose.R[2], s.specimen)
+    figures["specimen"] = specimen.figures(found)
+    times["specimen"] = perf_counter() - start
     levels: tuple[Surface, ...] = ()
     if surface:
         tell("meshing", 0.85)

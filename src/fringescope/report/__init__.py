@@ -1,6 +1,7 @@
 """Pictures for people: error maps, reasons, rendered clouds and surfaces, contact sheets."""
 
 from fringescope.report.calibration import calibration_page
+from fringescope.report.comparison import change_colours, change_limit, change_picture, change_surface
 from fringescope.report.figures import (
     REASON_COLOURS,
     Panel,
@@ -32,6 +33,10 @@ __all__ = [
     "around",
     "bin_map",
     "calibration_page",
+    "change_colours",
+    "change_limit",
+    "change_picture",
+    "change_surface",
     "contact_sheet",
     "error_map",
     "fringe_picture",

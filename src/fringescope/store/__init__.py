@@ -12,6 +12,7 @@ from fringescope.store.capture import (
     view_inputs,
     write_capture,
 )
+from fringescope.store.comparison import check_pair, put_comparison, read_strokes
 from fringescope.store.files import new_file, new_folder, write_json
 from fringescope.store.guidelines import parse_guidelines, pattern_document, read_guidelines
 from fringescope.store.images import Images, write_png, write_tiff
@@ -47,6 +48,7 @@ __all__ = [
     "StoredScan",
     "board_document",
     "calibration_document",
+    "check_pair",
     "check_rig",
     "hash_capture",
     "hash_rig",
@@ -58,6 +60,7 @@ __all__ = [
     "pattern_document",
     "plain",
     "put_capture",
+    "put_comparison",
     "put_decoded",
     "put_patterns",
     "put_scan",
@@ -69,6 +72,7 @@ __all__ = [
     "read_rig",
     "read_scan",
     "read_session",
+    "read_strokes",
     "response_document",
     "rig_document",
     "spooled",

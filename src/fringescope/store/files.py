@@ -31,6 +31,7 @@ except ImportError:  # no such locks here: nothing is swept
 from fringescope.errors import FormatError, OutputError
 
 CAPTURE, SCAN, DECODED, PLAN, BOARD = "capture.json", "scan.json", "decoded.json", "plan.json", "board.json"
+COMPARISON = "compare.json"
 
 #: files that stand beside the cameras' folders in a capture, a scan, a decoded capture or patterns
 BESIDE = frozenset((CAPTURE, SCAN, DECODED, PLAN, "cloud.ply", "surface.glb", "preview.glb", "view.html"))

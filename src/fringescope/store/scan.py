@@ -129,7 +129,8 @@ def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """ "sha256:..." of a file."""
     with path.open("rb") as f:
         return "sha256:" + hashlib.file_digest(f, "sha256").hexdigest()
 
@@ -169,7 +170,7 @@ def put_scan(
             "rig": rig_hash,
             "settings": plain(settings),
             "software": __version__,
-            "cloud": _sha256(folder / "cloud.ply"),
+            "cloud": sha256(folder / "cloud.ply"),
         }
         hash_ = files.canonical_hash(identity)
         extras = {"scan": hash_, "rig": rig_hash, "units": "mm", "generator": f"fringescope {__version__}"}
@@ -181,7 +182,7 @@ def put_scan(
             task.result()
         written = [p for p in sorted(folder.rglob("*")) if p.is_file()]
         names = [str(p.relative_to(folder).as_posix()) for p in written]
-        digests = dict(zip(names, pool.map(_sha256, written), strict=True))
+        digests = dict(zip(names, pool.map(sha256, written), strict=True))
     verdicts = {v.camera: plain(v) for v in scan.verdicts}
     photos = {
         p.camera: {
@@ -283,7 +284,7 @@ def read_scan(folder: Path | str, *, grids: bool = True, check: bool = True) -> 
     for name, digest in listed.items():
         if files.check_relative(name) is not None or not (folder / name).is_file():
             raise FormatError(f"{folder}: {files.shown(name)} is missing; scan.json lists it: copy the whole folder")
-        if check and _sha256(folder / name) != digest:
+        if check and sha256(folder / name) != digest:
             raise FormatError(f"{folder / name}: changed since the scan was written; reconstruct it again")
     out = [_read_grid(folder, entry, doc.get("grids") == "tif", path) for entry in doc["views"]] if grids else []
     pictures = [_read_picture(folder, entry, g, path) for entry, g in zip(doc["views"], out, strict=bool(out))]
