@@ -31,6 +31,8 @@ class CalibrationError(FringescopeError):
 
 class GuidanceError(FringescopeError):
     """A guideline that cannot be shown as it was asked for: what is wrong with it."""
+
+
 class RegistrationError(FringescopeError):
     """Two surfaces that cannot be laid on each other: other specimens, bent, moved too far, other instruments."""
 

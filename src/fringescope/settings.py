@@ -306,6 +306,9 @@ class LoopSettings(_Section):
     max_height_mm: float = knob(0.15, "mm", "lines that lie farther off the scanned surface say that it has changed", "", 0)
     accept_um: float = knob(150.0, "um", "guidance whose lines land farther than this from the asked ones (p95) is not as it should be", "", 1)
     exposure_us: int = knob(16000, "us", "exposure of the pictures in which lines are looked for", "", 10, 10_000_000)
+
+
+@dataclass(frozen=True)
 class ExaminationSettings(_Section):
     """When a guideline may be projected, and for how long without a word (IV-D)."""
 
@@ -323,6 +326,9 @@ class GuardSettings(_Section):
     deadline_ms: float = knob(40.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
     lease_s: float = knob(2.0, "s", "for so long at most the owner lets a thread beat for it while it is busy", "", 0.02, 60)
     start_s: float = knob(20.0, "s", "the watchdog must be ready in this time", "", 0.1, 600)
+
+
+@dataclass(frozen=True)
 class SpecimenSettings(_Section):
     """The specimen told from its substrate, and its size."""
 

@@ -63,6 +63,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "guide": (
         "guiding",
         "Guidelines to the picture that the projector shows, and what of them is visible and how exact.",
+    ),
     "compare": (
         "comparing",
         "Two scans, before and after a cut: what was removed, where, how surely, and how far from the guideline.",
