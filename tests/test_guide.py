@@ -74,6 +74,14 @@ def test_ribbons_cover_what_points_say(mirrors: bool) -> None:
     assert out.sum() == pytest.approx(whole, rel=0.04)
 
 
+def test_paint_is_a_weighted_mean(rng: np.random.Generator) -> None:
+    share = np.where(rng.random((9, 11)) < 0.3, 0, rng.random((9, 11))).astype(np.float32)
+    color, under = np.float32([0.2, 1.0, 0.5]), rng.random((9, 11, 3)).astype(np.float32)
+    out = under.copy()
+    k.paint(share, color, out)
+    assert out == pytest.approx(under * (1 - share[..., None]) + share[..., None] * color, abs=1e-6)
+
+
 # ----------------------------------------------------------------------------------------------------- where it lies
 
 

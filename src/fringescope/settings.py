@@ -305,6 +305,8 @@ class LoopSettings(_Section):
     surface_mm: float = knob(0.03, "mm", "error of the scanned surface that is expected when lines are triangulated", "", 0.001)
     max_height_mm: float = knob(0.15, "mm", "lines that lie farther off the scanned surface say that it has changed", "", 0)
     accept_um: float = knob(150.0, "um", "guidance whose lines land farther than this from the asked ones (p95) is not as it should be", "", 1)
+    look_s: float = knob(0.5, "s", "pause between two looks at the specimen while guidance is shown", "", 0)
+    patience_s: float = knob(10.0, "s", "guidance goes dark if nobody could look at the specimen for so long", "", 0.1)
     exposure_us: int = knob(16000, "us", "exposure of the pictures in which lines are looked for", "", 10, 10_000_000)
 
 

@@ -64,6 +64,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "guiding",
         "Guidelines to the picture that the projector shows, and what of them is visible and how exact.",
     ),
+    "selftest": (
+        "guiding",
+        "Projects a cross grid on the calibration board and measures where its lines land: after each calibration.",
+    ),
     "compare": (
         "comparing",
         "Two scans, before and after a cut: what was removed, where, how surely, and how far from the guideline.",

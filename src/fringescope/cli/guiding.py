@@ -1,7 +1,8 @@
-"""The verb that brings an expert's strokes back onto the tissue: guide."""
+"""Verbs that bring an expert's strokes back onto the tissue, and prove where: guide, selftest."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,11 +11,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fringescope.cli.app import app
-from fringescope.cli.common import Force, Json, Progress, SetOption, SettingsFile, emit, existing, load_settings
+from fringescope.cli.common import (
+    INTERRUPTED,
+    Force,
+    Json,
+    Progress,
+    SetOption,
+    SettingsFile,
+    emit,
+    existing,
+    load_settings,
+    say,
+)
 from fringescope.errors import EmptyResultError, FormatError, GuidanceError, UsageError
 
 if TYPE_CHECKING:
-    from fringescope.devices.base import Station
+    from fringescope.guide import Tissue
+    from fringescope.settings import Settings
     from fringescope.store import StoredScan
     from fringescope.types import U8, Guidance, Landing
 
@@ -33,6 +46,10 @@ def guide(
     ] = False,
     device: Annotated[
         str | None, typer.Option(metavar="URI", help="The instrument for --verify; default: that of the scan.")
+    ] = None,
+    show: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Project it for so long (0: until Ctrl-C), and watch the specimen."),
     ] = None,
     dashed: Annotated[
         bool, typer.Option("--dashed", help="Draw dashes: it is in doubt whether the strokes still fit.")
@@ -55,11 +72,13 @@ def guide(
     with Progress() as progress:
         asked = store.read_guidelines(guidelines)
         stored = progress.run("reading the scan", lambda: store.read_scan(scan))
+        uri = instrument_of(device, stored) if verify or show is not None else ""
         r = store.read_rig(rig)
         hashes = str(stored.document.get("hash")), store.hash_rig(rig)
         if stored.document.get("rig") != hashes[1]:
             raise FormatError(f"{rig}: is not the rig that {scan} was made with; reconstruct with this rig first")
         from fringescope import export
+        from fringescope.devices import registry
         from fringescope.pipeline import closing
         from fringescope.pipeline import guidance as recipe
 
@@ -71,7 +90,7 @@ def guide(
         pictures: dict[str, U8] = {}
         landings: Sequence[Landing] = ()
         if verify:
-            with open_instrument(device, stored) as station:
+            with registry.open_station(uri) as station:
                 closed = progress.run("closed loop", lambda: closing.close_loop(made, tissue, station, s))
             landings = closed.landings
             pictures = {f"{c}-landed": p for c, p in closing.landing_pictures(closed, r, s).items()}
@@ -95,6 +114,8 @@ def guide(
             store.write_png(path, pictures[camera])
     result: dict[str, Any] = {"pattern": str(out), **doc, "previews": {c: str(p) for c, p in beside.items()}}
     emit(result, json, [f"{out}: {len(made.strokes) + len(asked.refused)} strokes", *lines])
+    if show is not None:
+        _project(uri, stored, tissue, made, recipe.project_guidance(asked, tissue, s, dashed=True), show, s)
     far = [x for x in landings if x.p95_um is not None and x.p95_um > s.loop.accept_um]
     if far:
         raise GuidanceError(
@@ -105,14 +126,37 @@ def guide(
         raise EmptyResultError("no projected line was found in any picture; " + "; ".join(landings[0].words))
 
 
-def open_instrument(device: str | None, scan: StoredScan) -> Station:
-    """The instrument at a URI, or the one that a scan was made with. Raises UsageError where neither is known."""
+def _project(
+    uri: str, stored: StoredScan, tissue: Tissue, made: Guidance, dashed: Guidance, seconds: float, s: Settings
+) -> None:
+    """Shows guidance under a watchdog for `seconds`, or until Ctrl-C. Raises GuidanceError where it had to go dark."""
     from fringescope.devices import registry
+    from fringescope.devices.watchdog import Guard
+    from fringescope.pipeline import projecting, watching
 
+    pictures, masks = stored.every_picture(), projecting.lit_masks(made, tissue)
+    end = None if seconds <= 0 else time.monotonic() + seconds
+
+    def stop() -> bool:
+        return INTERRUPTED.is_set() or (end is not None and time.monotonic() > end)
+
+    with registry.open_station(uri) as station, Guard(station.projector, s.guard) as guard:
+        ended = projecting.hold(
+            station, guard, made, dashed,
+            lambda: watching.watch(station, stored.grids, pictures, tissue.rig, s, noise=stored.noise(), masks=masks),
+            stop, s, lambda v: say(f"{v.verdict.value}: {v.why}"),
+        )  # fmt: skip
+    if ended.ended != "stopped":
+        raise GuidanceError(f"the projector is dark: {ended.ended}: {ended.why}")
+    say("the projector is dark: stopped, as was asked")
+
+
+def instrument_of(device: str | None, scan: StoredScan) -> str:
+    """The URI that was given, or that of the instrument that a scan was made with. Raises UsageError without both."""
     uri = device or scan.instrument
     if uri is None:
         raise UsageError("which instrument made this scan is not known; name it with --device URI")
-    return registry.open_station(uri)
+    return uri
 
 
 def summary(made: Guidance, landings: Sequence[Landing] = ()) -> list[str]:
@@ -126,3 +170,43 @@ def summary(made: Guidance, landings: Sequence[Landing] = ()) -> list[str]:
         if g.stroke.id in landed:
             out.append(f"  landed: {landing_caption(landed[g.stroke.id])}")
     return out
+
+
+@app.command()
+def selftest(
+    rig: Annotated[Path, typer.Option(help="The rig.json of this instrument, just calibrated.")],
+    device: Annotated[str, typer.Option(metavar="URI", help="The instrument, with the board lying under it.")],
+    out: Annotated[Path, typer.Option(help="A new folder for selftest.json and a picture of each camera.")],
+    settings: SettingsFile = None,
+    set_: SetOption = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Projects a cross grid on the calibration board and measures where its lines land: after each calibration.
+
+    Exit status 1 if they lie farther than loop.accept_um (p95) from where they were asked for.
+    """
+    from fringescope import store
+    from fringescope.devices import registry
+    from fringescope.pipeline import closing
+    from fringescope.pipeline.selftest import self_test
+
+    s = load_settings(settings, set_)
+    r = store.read_rig(rig)
+    with store.new_folder(out, marker="selftest.json", force=force) as tmp, Progress() as progress:
+        with registry.open_station(device) as station:
+            found = progress.run("self-test", lambda: self_test(station, r, s))
+        doc = store.pattern_document(found.guidance, {}, found.closed.landings, {"rig": store.hash_rig(rig)})
+        told = {
+            "format": "fringescope-selftest", "version": 1, "ok": found.ok, "median_um": found.median_um,
+            "p95_um": found.p95_um, "max_um": found.max_um, "limit_um": s.loop.accept_um, "strokes": doc["strokes"],
+            "rig": doc["rig"], "device": device,
+        }  # fmt: skip
+        store.write_json(tmp / "selftest.json", store.plain(told))
+        for camera, picture in closing.landing_pictures(found.closed, r, s).items():
+            store.write_png(tmp / f"{camera}.png", picture)
+    verdict = "as it should be" if found.ok else f"not as it should be ({s.loop.accept_um:.0f} um): calibrate again"
+    line = f"cross grid: median {found.median_um:.0f}, p95 {found.p95_um:.0f}, max {found.max_um:.0f} um: {verdict}"
+    emit({"selftest": str(out), **told}, json, [line])
+    if not found.ok:
+        raise typer.Exit(1)

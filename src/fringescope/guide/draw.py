@@ -58,9 +58,7 @@ class Canvas:
             share, left, top = share[max(-top, 0) :, max(-left, 0) :], max(left, 0), max(top, 0)
         part = self._light[top : top + share.shape[0], left : left + share.shape[1]]
         share = share[: part.shape[0], : part.shape[1]]
-        a = share[..., None]
-        part *= 1 - a
-        part += a * color
+        k.paint(share, color, part)
         rows, columns = part.shape[:2]
         self._touched = (
             slice(min(self._touched[0].start, top), max(self._touched[0].stop, top + rows)),

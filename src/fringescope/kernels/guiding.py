@@ -150,3 +150,14 @@ def ribbons(first, last, parts, diamond, top, out):
                 share = np.float32(_within(step * c + shift, float(row + top), ribbon, pitch))
                 if share > out[row, c]:
                     out[row, c] = share
+
+
+@by_rows(lambda share, *_: share.shape[0])
+def paint(first, last, share, color, out):
+    """A colour (3,) over a picture (h, w, 3), as much of it as `share` (h, w) says; float32."""
+    for row in range(first, last):
+        for c in range(share.shape[1]):
+            a = share[row, c]
+            if a > 0.0:
+                for i in range(3):
+                    out[row, c, i] += a * (color[i] - out[row, c, i])

@@ -14,7 +14,7 @@ from fringescope.report.figures import (
     reasons_picture,
 )
 from fringescope.report.guidance import caption as guidance_caption
-from fringescope.report.guidance import guidance_preview, landing_caption, landing_picture
+from fringescope.report.guidance import guidance_preview, landing_caption, landing_picture, plane_light
 from fringescope.report.render import DARK, WHITE, Light, Viewpoint, render_cloud, render_surface
 from fringescope.report.response import RippleCurve, response_picture
 from fringescope.report.sighting import sighting_picture
@@ -45,6 +45,7 @@ __all__ = [
     "landing_caption",
     "landing_picture",
     "phase_picture",
+    "plane_light",
     "reasons_map",
     "reasons_picture",
     "render_cloud",

@@ -1,0 +1,123 @@
+"""Guidance on the tissue for as long as it is true: shown under a watchdog, while somebody keeps looking."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from fringescope import geometry, guide, report
+from fringescope.devices.base import Station
+from fringescope.errors import FringescopeError
+from fringescope.settings import Settings
+from fringescope.types import Bool, Guidance, Standing, Watched
+
+GLOW_MM = 1.0  #: so far around the projected lines the tissue glows too
+
+
+class Guard(Protocol):
+    """What keeps the projector from shining on when nobody answers any more (`devices.watchdog.Guard`)."""
+
+    def beat(self) -> None:
+        """Somebody is there. Raises DeviceLostError once the projector was made dark."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """How a projection ended: `ended` is "stopped", "stale" or "lost", `why` in words; all verdicts, in order."""
+
+    ended: str
+    why: str
+    verdicts: tuple[Watched, ...]
+
+
+def lit_masks(guidance: Guidance, tissue: guide.Tissue) -> dict[str, Bool]:
+    """Which pixels (H, W) of each camera the projected lines, and their glow, change: by the camera's name."""
+    projector = tissue.rig.projector
+    light = report.plane_light(guidance.image, projector).max(axis=2)
+    out = {}
+    for grid, footprint in zip(tissue.grids, tissue.footprints, strict=True):
+        uv = geometry.project(projector, grid.xyz).astype(np.float32)
+        uv[~np.isfinite(uv)] = -10
+        lit = cv2.remap(light, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        reach = max(1, round(GLOW_MM / footprint)) if footprint else 1
+        around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        out[grid.camera] = cv2.dilate((lit > 0.01).astype(np.uint8), around) > 0
+    return out
+
+
+def hold(
+    station: Station,
+    guard: Guard,
+    guidance: Guidance,
+    dashed: Guidance,
+    look: Callable[[], Watched],
+    stop: Callable[[], bool],
+    settings: Settings | None = None,
+    tell: Callable[[Watched], None] | None = None,
+) -> Projected:
+    """Shows guidance until `stop` says so, or until it is no longer true. The projector is dark afterwards, whatever.
+
+    `look` compares what is seen with the scan (`watching.watch`, with the masks of `lit_masks`): before anything is
+    shown, and again and again meanwhile, in a thread beside the beats of the `guard`. VALID: the guidance. SUSPECT:
+    `dashed`, the same in dashes. STALE, a look that fails, or none for `watch.patience_s`: dark. `tell` hears every
+    verdict.
+    """
+    s = settings or Settings()
+    verdicts: list[Watched] = []
+    failed: list[str] = []
+    over = threading.Event()
+    last = time.monotonic()
+
+    def judged() -> Watched:
+        verdict = look()
+        verdicts.append(verdict)
+        if tell is not None:
+            tell(verdict)
+        return verdict
+
+    def keep_looking() -> None:
+        nonlocal last
+        while not over.wait(s.loop.look_s):
+            try:
+                judged()
+            except FringescopeError as e:
+                failed.append(str(e))
+                return
+            last = time.monotonic()
+
+    first = judged()
+    if first.verdict is Standing.STALE:
+        return Projected("stale", first.why, tuple(verdicts))
+    watcher = threading.Thread(target=keep_looking, name="watch", daemon=True)
+    shown: Standing | None = None
+    last = time.monotonic()
+    try:
+        while True:
+            guard.beat()
+            now = verdicts[-1]
+            if failed:
+                return Projected("lost", f"the specimen can no longer be watched: {failed[0]}", tuple(verdicts))
+            if now.verdict is Standing.STALE:
+                return Projected("stale", now.why, tuple(verdicts))
+            if time.monotonic() - last > s.loop.patience_s:
+                return Projected("lost", f"no look at the specimen for {s.loop.patience_s:g} s", tuple(verdicts))
+            if stop():
+                return Projected("stopped", "as was asked", tuple(verdicts))
+            if now.verdict is not shown:
+                image = (guidance if now.verdict is Standing.VALID else dashed).image
+                station.projector.show(image if station.projector.info.colours else np.asarray(image.max(axis=2)))
+                shown = now.verdict
+                if not watcher.is_alive():
+                    watcher.start()
+            time.sleep(1e-3 * s.guard.beat_ms)
+    finally:
+        station.projector.dark()
+        over.set()
+        if watcher.is_alive():
+            watcher.join(s.loop.patience_s)
