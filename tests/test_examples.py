@@ -41,6 +41,15 @@ def test_scan_while_it_records(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"coarse.glb", "cloud.ply", "surface.glb"}
 
 
+def test_lines_on_the_tissue(tmp_path: Path) -> None:
+    said = run("06_lines_on_the_tissue.py", str(tmp_path / "out"), "0.05")
+    assert re.search(r"^cut: \d+\.\d mm, (9\d|100)% visible, expected error \d+ um$", said, re.M)
+    landed = re.search(r"^cut: landed (\d+) um", said, re.M)
+    assert landed is not None
+    assert int(landed[1]) < 60
+    assert (tmp_path / "out" / "preview-camera3.png").exists()
+
+
 def test_the_parts_take_away_and_never_add() -> None:
     left = [int(n) for n in re.findall(r"leaves (\d+) of", run("02_the_parts.py", "0.04"))]
     assert len(left) == 5

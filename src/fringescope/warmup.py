@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from fringescope import denoise, geometry, patterns, pipeline, report
+from fringescope.pipeline import guidance
 from fringescope.settings import MeshSettings, Settings
 from fringescope.twin import presets
 from fringescope.types import (
@@ -19,10 +20,12 @@ from fringescope.types import (
     FrameKey,
     FringeSet,
     GraySet,
+    Guidelines,
     PixelFormat,
     Response,
     Rig,
     Role,
+    Stroke,
     ViewInput,
     ViewPlan,
 )
@@ -81,6 +84,10 @@ def compile_kernels(every_plan: bool = False) -> int:
     denoise.agree((nearer, *scan.grids[1:]), rig, s.denoise)  # views that disagree
     if scan.surface is not None:
         report.render_surface(scan.surface, size=(64, 48))
+        tissue = guidance.tissue_of(scan.grids, scan.surface, rig, s)
+        middle = 0.5 * np.array(scan.grids[0].reasons.shape[::-1])
+        stroke = Stroke("a line", camera=scan.grids[0].camera, pixels=np.stack([middle, middle + 5]))
+        guidance.project_guidance(Guidelines((stroke,)), tissue, s)
     if every_plan:
         _other_plans(rig, views[0], s)
     return len(scan.cloud)

@@ -39,7 +39,9 @@ def close_loop(guidance: Guidance, tissue: guide.Tissue, station: Station, setti
         raise DeviceError(f"{i.uri} shows {i.width} x {i.height}; the guidance is for {w} x {h}: use the rig's device")
     cameras = cameras_of(station, tissue.rig, [g.camera for g in tissue.grids])
     formats = [c.settings.pixel_format for c in cameras]
-    image = guidance.image if i.colours else np.asarray(guidance.image.max(axis=2))
+    image = guidance.image
+    if not i.colours or bool((np.ptp(image, axis=2) == 0).all()):
+        image = np.asarray(image.max(axis=2))  # grey
     taken = []
     try:
         for picture in (None, np.full((i.height, i.width), 255, np.uint8), image):
