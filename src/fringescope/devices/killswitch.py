@@ -61,7 +61,8 @@ class Latch:
             text = why.encode()[:_LONGEST]
             entry = _MARK.pack(0, time.monotonic_ns(), len(text), text)
             self._page[where + 1 : where + len(entry)] = entry[1:]
-            self._page[where] = 1  # last, in one byte: who sees it sees the rest
+            self._page[where] = 1  # after the rest, in one byte: who sees it sees the rest
+            self._page[where + 8 : where + 16] = struct.pack("<q", time.monotonic_ns())  # it holds from here, or before
 
     def read(self, where: int) -> Cut | None:
         """A mark, None while it is not set."""

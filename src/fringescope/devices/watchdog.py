@@ -22,6 +22,7 @@ import json
 import os
 import select
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -37,7 +38,7 @@ from fringescope.settings import GuardSettings
 if TYPE_CHECKING:
     from fringescope.devices.base import Projector
 
-_BEAT, _QUIT = b".", b"q"  #: what the owner says
+_BEAT = struct.Struct("<q")  #: what the owner says: when it said so, `time.monotonic_ns`; 0 = it is over
 _READY, _ALIVE, _CUT = b"r", b".", b"c"  #: what the watchdog says
 _MS = 1_000_000
 _LOOK_AGAIN_S = 0.002  #: for whoever was kept from the processor: the sign may lie in the pipe
@@ -191,12 +192,13 @@ class Guard:
                 os.write(self._process.stdin.fileno(), data)
 
     def _beat(self) -> None:
+        now = time.monotonic_ns()
         try:
-            self._send(_BEAT)
+            self._send(_BEAT.pack(now))
         except OSError:
             self._trip("the watchdog has ended")
         else:
-            self._sent_ns = time.monotonic_ns()
+            self._sent_ns = now
 
     def _hear(self, pipe: IO[bytes]) -> None:
         """Reads the watchdog's signs until it ends."""
@@ -242,7 +244,7 @@ class Guard:
         if p is None or p.stdin is None or p.stdout is None or p.stderr is None:
             return
         with contextlib.suppress(OSError):
-            self._send(_QUIT)
+            self._send(_BEAT.pack(0))
         with self._lock, contextlib.suppress(OSError):
             p.stdin.close()
         try:
@@ -268,7 +270,9 @@ class Guard:
 
 def _launch() -> subprocess.Popen[bytes]:
     """The watchdog's process: another Python, which shares three pipes with this one, and finds what this one finds."""
-    how: dict[str, Any] = {"start_new_session": True}  # Ctrl-C is for the owner
+    # Ctrl-C is for the owner. A session of its own would do, too; but Linux schedules sessions as groups, and one that
+    # has just started and mostly sleeps was seen to wait for seconds on a busy machine.
+    how: dict[str, Any] = {"process_group": 0}
     if sys.platform == "win32":
         how = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.HIGH_PRIORITY_CLASS}
     path = os.pathsep.join(p or os.getcwd() for p in sys.path)  # noqa: PTH109
@@ -288,30 +292,39 @@ def _described(switch: KillSwitch) -> dict[str, Any]:
 
 
 class _Pipe:
-    """What came through the owner's pipe, read by a thread of its own: not every system waits for pipes otherwise."""
+    """What came through the owner's pipe. A beat counts from when it was sent, however late it is read."""
 
     def __init__(self, number: int) -> None:
-        self._number = number
         self.beat_ns, self.gone, self.quit = 0, False, False  #: no beat yet: nothing is shown yet
-        self.news = threading.Event()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._number, self._rest = number, b""
+        self._news = threading.Event()
+        if sys.platform == "win32":  # where nobody can wait for a pipe and for time at once
+            threading.Thread(target=self._follow, daemon=True).start()
 
-    def unread(self) -> bool:
-        """Whether something lies in the pipe that the thread has not read yet."""
-        if sys.platform == "win32":  # only sockets can be asked there: let the thread run instead
-            before = self.beat_ns
-            time.sleep(_LOOK_AGAIN_S)
-            return self.beat_ns != before
-        return bool(select.select([self._number], [], [], 0)[0]) and not self.gone
+    def wait(self, seconds: float) -> None:
+        """Until there is news, but no longer than that."""
+        if self.gone or self.quit:
+            time.sleep(seconds)
+        elif sys.platform == "win32":
+            self._news.wait(seconds)
+            self._news.clear()
+        elif select.select([self._number], [], [], seconds)[0]:
+            self._take()
 
-    def _read(self) -> None:
-        while data := _read(self._number):
-            self.beat_ns = time.monotonic_ns()
-            if _QUIT in data:
-                self.quit = True
-                self.news.set()
-        self.gone = True
-        self.news.set()
+    def _follow(self) -> None:
+        while not self.gone:
+            self._take()
+            self._news.set()
+
+    def _take(self) -> None:
+        data = _read(self._number)
+        self.gone = not data
+        data = self._rest + data
+        whole = len(data) - len(data) % _BEAT.size
+        for (sent,) in _BEAT.iter_unpack(data[:whole]):
+            self.quit |= sent == 0
+            self.beat_ns = max(self.beat_ns, min(sent, time.monotonic_ns()))
+        self._rest = data[whole:]
 
 
 def _read(number: int) -> bytes:
@@ -335,7 +348,7 @@ def watch(switch: KillSwitch, pipe: _Pipe, out: int, beat_ms: float, deadline_ms
             with contextlib.suppress(OSError):  # nobody hears: then the other pipe has closed, too
                 os.write(out, _ALIVE)
             told = now
-        pipe.news.wait(0.25e-3 * beat_ms)
+        pipe.wait(0.25e-3 * beat_ms)
     while True:
         try:
             switch.cut(why)
@@ -352,8 +365,7 @@ def _reason(switch: KillSwitch, pipe: _Pipe, deadline_ms: float) -> str:
         return "the watchdog's owner is gone"
     if pipe.quit or not pipe.beat_ns or time.monotonic_ns() - pipe.beat_ns <= deadline_ms * _MS:
         return ""
-    if pipe.unread():
-        return ""  # kept from the processor, and so was the thread that reads
+    pipe.wait(0.0 if sys.platform != "win32" else _LOOK_AGAIN_S)  # kept from the processor, perhaps, and not the owner
     silent_ms = (time.monotonic_ns() - pipe.beat_ns) / _MS
     return f"no heartbeat for {silent_ms:.0f} ms" if silent_ms > deadline_ms and not pipe.quit else ""
 
@@ -402,7 +414,7 @@ def main() -> int:
         with contextlib.suppress(OSError):
             os.write(1, _CUT)
     while not (pipe.gone or pipe.quit):  # to tidy up after an owner who cannot
-        pipe.news.wait(1.0)
+        pipe.wait(1.0)
     if not pipe.quit:
         switch.clean()
     return 3 if why else 0
