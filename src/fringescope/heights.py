@@ -190,11 +190,12 @@ def pieces(mask: Bool) -> tuple[int, AnyArray, AnyArray]:
 def outline(where: Layout, height: F64, inside: Bool, level: float, steep: float | None = None) -> F64:
     """Places (n, 2) between cells inside and their neighbours outside where the height crosses `level`.
 
-    Halfway where the heights do not say. Where they differ by more than a cell's side the cell inside straddles a wall:
+    Halfway where the heights do not say. Where the surface is steeper than 45 degrees the cell inside straddles a wall:
     then, if `steep` is given, that share of the way to the neighbour (below 0: back into the cell).
     """
     found = []
     h, w = inside.shape
+    top = cv2.dilate(np.where(inside, height, -np.inf), np.ones((3, 3), np.uint8))
     for di, dj in ((0, 1), (1, 0)):
         a, b = inside[: h - di, : w - dj], inside[di:, dj:]
         i, j = np.nonzero(a != b)
@@ -202,7 +203,8 @@ def outline(where: Layout, height: F64, inside: Bool, level: float, steep: float
         with np.errstate(invalid="ignore", divide="ignore"):
             t = np.where(za * zb < 0, za / (za - zb), 0.5)
         if steep is not None:
-            t = np.where(np.abs(za - zb) > where.cell_mm, np.where(inside[i, j], steep, 1 - steep), t)
+            drop = np.maximum(top[i, j], top[i + di, j + dj]) - np.minimum(za, zb) - level
+            t = np.where(drop > 2 * where.cell_mm, np.where(inside[i, j], steep, 1 - steep), t)
         found.append(where.low + where.cell_mm * np.stack([j + t * dj, i + t * di], 1))
     return np.concatenate(found)
 

@@ -367,7 +367,7 @@ class CompareSettings(_Section):
     """What changed between two scans."""
 
     sigma: float = knob(4.0, "sigma", "a change counts where it exceeds this, of noise, registration and what unchanged places show", "", 1)
-    least_mm: float = knob(0.03, "mm", "and this", "", 0)
+    least_mm: float = knob(0.03, "mm", "and by how much more", "", 0)
     min_area_mm2: float = knob(2.0, "mm^2", "smaller changes are crumbs", "", 0)
     margin_mm: float = knob(0.5, "mm", "the volume of a change is taken so far around it, where it falls below what counts", "", 0)
     patch_mm: float = knob(5.0, "mm", "errors of unchanged places farther apart than this are independent", "", 0.1)

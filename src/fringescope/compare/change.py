@@ -236,7 +236,7 @@ def _regions(
     frame: Frame, where: Layout, depth: F64, total: F64, local: F64, patches: float, moved: F64, covariance: F64,
     seen: Bool, domain: Bool, tops: tuple[F64, F64, F64], common: float, grounded: bool, s: CompareSettings,
 ) -> Change:  # fmt: skip
-    full_a, full_b, _ = tops
+    full_a = tops[0]
     smooth = np.asarray(cv2.medianBlur(depth.astype(np.float32), 3), dtype=np.float64)
     limit = s.sigma * total + s.least_mm
     known = domain & (np.abs(smooth) < s.max_depth_mm)

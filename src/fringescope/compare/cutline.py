@@ -15,12 +15,13 @@ HOLE_MM2 = 10.0  #: smaller unchanged places within a cut have no rim
 
 
 def cut_line(
-    width_mm: float | None, core: Bool, frame: Frame, where: Layout, smooth: F64, limit: F64, full_a: F64, domain: Bool, grounded: bool,
+    width_mm: float | None, core: Bool, frame: Frame, where: Layout, smooth: F64, limit: F64, full_a: F64,
+    domain: Bool, grounded: bool,
 ) -> F64:  # fmt: skip
     """Where a cut ran, (n, 3) world mm on the first surface: the centre line of a kerf of `width_mm`, else the rim.
 
-    Maps (h, w): `core` the changed cells, `smooth` the depth removed, `limit` what counts, both surfaces' heights,
-    `domain` what was compared; `grounded`: heights are above a substrate.
+    Maps (h, w): `core` the changed cells, `smooth` the depth removed, `limit` what counts, `full_a` the first
+    surface's height, `domain` what was compared; `grounded`: heights are above a substrate.
     """
     if width_mm is not None:
         xy = _centre_line(where, core, smooth, max(width_mm, 2 * where.cell_mm))

@@ -201,10 +201,16 @@ def _dense(line: F64, step: float = 2.0) -> F64:
 # ------------------------------------------------------------------------------------------------------------ pictures
 
 
+def _shown(c: Comparison, depth: F64, labels: AnyArray) -> AnyArray:
+    """The regions without the margin around them, where nothing is to be seen."""
+    return np.where(np.abs(np.nan_to_num(depth)) > 4 * c.change.noise_mm, labels, 0)
+
+
 def coloured_cloud(cloud: Cloud, c: Comparison) -> Cloud:
     """The second scan's points; those that changed coloured by the depth removed."""
     limit = report.change_limit(c.change.depth, c.change.labels)
     depth, labels = compare.depth_at(c.change, cloud.xyz)
+    labels = _shown(c, depth, labels)
     rgb = np.where((labels > 0)[:, None], report.change_colours(depth, limit), cloud.rgb)
     return replace(cloud, rgb=rgb.astype(np.uint8))
 
@@ -213,7 +219,7 @@ def coloured_surface(surface: Surface, c: Comparison) -> Surface:
     """The second scan's mesh; triangles that changed coloured by the depth removed, the others with their pictures."""
     limit = report.change_limit(c.change.depth, c.change.labels)
     depth, labels = compare.depth_at(c.change, surface.vertices)
-    return report.change_surface(surface, depth, labels, limit)
+    return report.change_surface(surface, depth, _shown(c, depth, labels), limit)
 
 
 def picture(c: Comparison, title: str) -> U8:
@@ -227,7 +233,8 @@ def picture(c: Comparison, title: str) -> U8:
     shown = ch.surface - np.where(ch.labels > 0, np.nan_to_num(ch.depth), 0.0)
     low = (float(ch.layout.low[0]), float(ch.layout.low[1]))
     strokes = [ch.frame.local(x)[:, :2] for x in c.strokes]
-    return report.change_picture(ch.depth, ch.labels, shown, low, ch.layout.cell_mm, title, figures, strokes,
+    labels = _shown(c, ch.depth, ch.labels)
+    return report.change_picture(ch.depth, labels, shown, low, ch.layout.cell_mm, title, figures, strokes,
                                  ch.frame.local(ch.cut)[:, :2])  # fmt: skip
 
 
