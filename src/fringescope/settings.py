@@ -258,7 +258,7 @@ class WatchSettings(_Section):
     max_light_factor: float = knob(12.0, "", "see max_light: a film that dries changes a little everywhere", "", 1)
     max_light_ever: float = knob(0.5, "", "a place that changed by more than this is never as it was scanned", "", 0.001)
     max_gain: float = knob(1.6, "", "pictures brighter or darker than the scan's by more than this factor are of another light or exposure", "", 1.01)
-    bright: float = knob(0.3, "", "spots brighter than their surroundings by this share are highlights and do not vote", "", 0.01)
+    bright: float = knob(0.6, "", "spots brighter than a tile around them by this share are highlights and do not vote", "", 0.01)
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,8 @@ def _track(v: View, camera: Camera, s: WatchSettings) -> judging.Tested:
         return judging.blind(name, _why_not(now, fmt))
     off = max(max(g, 1 / max(g, 1e-6)) for g in p.gain)
     if off > s.max_gain:
+        if min(p.gain) < 0.05:
+            return judging.blind(name, "the picture is dark", p.gain)
         return judging.blind(name, f"the picture is {np.median(p.gain):.2f} times as bright as the scan's", p.gain)
     surface = preparing.binned(valid.astype(np.float32), n)
     levels = tracking.track(p, surface, s)

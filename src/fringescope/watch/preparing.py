@@ -91,12 +91,12 @@ def robust_line(x: F64, y: F64, prior: float) -> tuple[float, float]:
 
 
 def highlights(a: F32, ok: Bool, s: WatchSettings) -> Bool:
-    """Bright spots (h, w) narrower than about two thirds of a tile: what a film mirrors."""
-    side = max(3, 2 * s.tile // 3 // 2 * 2 + 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    filled = np.where(ok, a, 0.0).astype(np.float32)
-    ground = cv2.morphologyEx(filled, cv2.MORPH_OPEN, disc)
-    return np.asarray(cv2.dilate((filled > (1 + s.bright) * ground + 1.0).astype(np.uint8), np.ones((3, 3))) > 0)
+    """Spots (h, w) much brighter than what lies within a tile around them: what a film mirrors."""
+    side = (2 * s.tile + 1, 2 * s.tile + 1)
+    part = cv2.boxFilter(ok.astype(np.float32), -1, side)
+    around = cv2.boxFilter(np.where(ok, a, 0.0).astype(np.float32), -1, side) / np.maximum(part, 1e-3)
+    spots = ok & (a > (1 + s.bright) * around + 1.0)
+    return np.asarray(cv2.dilate(spots.astype(np.uint8), np.ones((3, 3))) > 0)
 
 
 def noise_of(then: AnyArray, now: AnyArray, fmt: PixelFormat) -> NoiseModel:

@@ -98,13 +98,13 @@ def _level(
     r0, c0 = r0[keep], c0[keep]
     count = len(r0)
     centre = (np.stack([c0, r0], 1) + (n - 1) / 2.0) * scale + (scale - 1) / 2.0
-    w = _patches(weight.astype(np.float32), r0, c0, n).reshape(count, -1)
-    ref = _patches(a, r0, c0, n).reshape(count, -1)
+    w = _patches(weight.astype(np.float32), r0, c0, n).reshape(count, n * n)
+    ref = _patches(a, r0, c0, n).reshape(count, n * n)
     mean = (w * ref).sum(1, keepdims=True) / np.maximum(w.sum(1, keepdims=True), 1e-12)
-    grad = [_patches(g, r0, c0, n).reshape(count, -1) for g in (gx, gy)]
+    grad = [_patches(g, r0, c0, n).reshape(count, n * n) for g in (gx, gy)]
     y, x = (np.broadcast_to(a.ravel().astype(np.float32) / n, ref.shape) for a in np.mgrid[:n, :n] - (n - 1) / 2.0)
     A = np.stack([-grad[0], -grad[1], ref - mean, np.ones_like(ref), x, y], 1)  # (count, 6, n n)
-    again = [_patches(smooth(g), r0, c0, n).reshape(count, -1) for g in (gx, gy, a)]
+    again = [_patches(smooth(g), r0, c0, n).reshape(count, n * n) for g in (gx, gy, a)]
     B = np.stack([-again[0], -again[1], again[2] - mean, np.ones_like(ref), x, y], 1)
 
     tiles = _Tiles(A, B, w, ref, b, ok_b.astype(np.uint8), c0, r0, n)
@@ -165,7 +165,7 @@ class _Tiles:
         n = self.side
         u = (self.c0[:, None] + np.tile(np.arange(n), n) + d[:, :1]).astype(np.float32)
         v = (self.r0[:, None] + np.repeat(np.arange(n), n) + d[:, 1:]).astype(np.float32)
-        got = cv2.remap(self.now, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        got = cv2.remap(self.now, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         seen = cv2.remap(self.ok, u, v, cv2.INTER_NEAREST, borderValue=0)
         return got - self.ref, self.weight * (seen > 0)
 
