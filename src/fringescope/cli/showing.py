@@ -16,6 +16,7 @@ from fringescope.cli.scanning import scan_into, scan_summary
 
 if TYPE_CHECKING:
     from fringescope.devices.simulated import World
+    from fringescope.settings import Settings
     from fringescope.types import F64, Scan
 
 
@@ -61,6 +62,39 @@ def judge(folder: Path, scan: Scan, world: World) -> dict[str, Any]:
     }
 
 
+def draw_and_land(folder: Path, scan: Scan, world: World, doc: dict[str, Any], s: Settings) -> dict[str, Any]:
+    """A line is drawn in the first camera's photograph, projected onto the specimen, and found where it landed.
+
+    Writes guidelines.json, pattern.png, pattern.json, guidance.png and landed.png; returns what became of the line.
+    """
+    import numpy as np
+
+    from fringescope import store
+    from fringescope.devices import simulated
+    from fringescope.pipeline import closing, guidance
+
+    grid, rig = scan.grids[0], world.instrument.rig
+    rows, columns = np.nonzero(grid.valid)
+    (top, bottom), (left, right) = np.percentile(rows, [10, 90]), np.percentile(columns, [10, 90])
+    t = np.linspace(0.2, 0.8, 60)
+    across, down = left + (right - left) * t, top + (bottom - top) * (0.5 + 0.06 * np.sin(14 * t))
+    pixels = np.round(np.stack([across, down], 1), 2).tolist()
+    stroke = {"id": "cut-1", "camera": grid.camera, "pixels": pixels, "width_mm": 0.8, "color": "#ffffff"}
+    asked = {"format": "fringescope-guidelines", "version": 1, "scan": doc["hash"], "rig": doc["rig"]}
+    store.write_json(folder / "guidelines.json", {**asked, "strokes": [stroke]})
+    tissue = guidance.tissue_of(scan.grids, scan.surface, rig, s)
+    made = guidance.project_guidance(store.read_guidelines(folder / "guidelines.json"), tissue, s)
+    with simulated.station(world) as station:
+        closed = closing.close_loop(made, tissue, station, s)
+    told = store.pattern_document(made, {}, closed.landings)
+    store.write_json(folder / "pattern.json", told)
+    store.write_png(folder / "pattern.png", made.image)
+    store.write_png(folder / "guidance.png", guidance.previews(made, tissue, scan.pictures, s)[grid.camera])
+    store.write_png(folder / "landed.png", closing.landing_pictures(closed, rig, s)[grid.camera])
+    line: dict[str, Any] = told["strokes"][0]
+    return {k: line.get(k) for k in ("length_mm", "visible", "expected_error_um", "landed", "refused")}
+
+
 def _has_screen() -> bool:
     """Whether a browser could open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -99,6 +133,9 @@ def demo(
         progress.run("kernels", compiling.wait)
         scan, doc = scan_into(tmp / "scan", tmp / "capture", rig, s, progress)
         found = progress.run("judging", lambda: judge(tmp, scan, world))
+        line = None
+        if scan.surface is not None:
+            line = progress.run("guidance", lambda: draw_and_land(tmp, scan, world, doc, s))
         words = [w for v in doc["views"] for w in v.get("words", ())]
         told = {
             "format": "fringescope-demo",
@@ -109,6 +146,7 @@ def demo(
             "seed": seed,
             "scan": doc["hash"],
             "error": found,
+            "guidance": line,
             "verdict": words,
         }
         store.write_json(tmp / "demo.json", store.plain(told))
@@ -118,9 +156,13 @@ def demo(
         f"99 % within {found['p99_um']:.0f} um, bias {found['bias_um']:+.2f} um; {found['flying_ppm']:.0f} of a "
         f"million points fly, farther than {BAND_MM:g} mm from it ({found['points']} points of all views)"
     )
-    lines += [
-        f"{out / n}" for n in ("capture", "scan", "error_map.png", "surface.png", "relief.png") if (out / n).exists()
-    ]
+    if line and line["landed"] and line["landed"]["median_um"] is not None:
+        lines.append(
+            f"a line of {line['length_mm']:.1f} mm, drawn in a photograph and projected onto the specimen, lies "
+            f"{line['landed']['median_um']:.0f} um (p95 {line['landed']['p95_um']:.0f} um) from where it was drawn"
+        )
+    names = ("capture", "scan", "error_map.png", "surface.png", "relief.png", "landed.png")
+    lines += [f"{out / n}" for n in names if (out / n).exists()]
     page = out / "scan" / "view.html"
     lines += [f"look at it: {page}"] if page.exists() else []
     emit({"demo": str(out), **told}, json, lines)

@@ -70,9 +70,9 @@ def landing_pictures(closed: Closed, rig: Rig, s: Settings) -> dict[str, U8]:
     """Where the lines were found, over what each camera saw: (h, w, 3) RGB by the camera's name."""
     out = {}
     for shot in closed.shots:
-        photo = fuse.photo(shot.guided, shot.pixel_format, shot.camera, s.fuse)
+        white, guided = (fuse.photo(f, shot.pixel_format, shot.camera, s.fuse).rgb for f in (shot.white, shot.guided))
         index = rig.index(shot.camera)
-        out[shot.camera] = report.landing_picture(photo.rgb, rig.cameras[index], index, closed.landings)
+        out[shot.camera] = report.landing_picture(0.4 * white + guided, rig.cameras[index], index, closed.landings)
     return out
 
 

@@ -78,13 +78,15 @@ def landing_caption(x: Landing) -> str:
 
 
 def landing_picture(
-    photo: F32, camera: Camera, index: int, landings: tuple[Landing, ...], wide: int = WIDE, times: float = 20.0
+    photo: F32, camera: Camera, index: int, landings: tuple[Landing, ...], wide: int = WIDE
 ) -> U8:
     """Where the lines were found, over a picture taken while they were projected; (h, w, 3) RGB.
 
-    `photo` (H, W, 3) linear light of camera number `index`. A green dot is a place where a line was found; the bar at
-    it shows its offset from the asked line, `times` larger.
+    `photo` (H, W, 3) linear light of camera number `index`. A green dot is a place where a line was found; the red bar
+    at it shows its offset from the asked line, enlarged as the caption says.
     """
+    worst = max((x.p95_um for x in landings if x.p95_um is not None), default=0.0)
+    times = next((t for t in (200, 100, 50, 20, 10, 5, 2) if t * worst <= 2000), 1)
     scale = min(1.0, wide / photo.shape[1])
     size = (max(1, round(photo.shape[1] * scale)), max(1, round(photo.shape[0] * scale)))
     out = _srgb(cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if scale < 1 else photo.copy())
@@ -98,7 +100,7 @@ def landing_picture(
                 _line(out, q, q + times * (p - q), (255, 64, 64), 1)
                 cv2.circle(out, (round(p[0] * 16), round(p[1] * 16)), 24, (64, 255, 96), -1, cv2.LINE_AA, 4)
         lines.append(f"{one.id}: {landing_caption(one)}")
-    return _captioned(out, [*lines, f"red: offset, {times:g} times"])
+    return _captioned(out, [*lines, f"red: offset, {times} times as large"])
 
 
 def _srgb(light: AnyArray) -> U8:
