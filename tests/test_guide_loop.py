@@ -213,6 +213,10 @@ class Beats:
         if self.lost_after is not None and self.count > self.lost_after:
             raise DeviceLostError("no heartbeat")
 
+    def lease(self, seconds: float) -> None:
+        assert 0 < seconds <= 2
+        self.beat()
+
 
 def verdict(standing: Standing, why: str = "as it was told") -> Watched:
     return Watched(standing, why, (), None, 1.0, 1.0)

@@ -306,6 +306,7 @@ class LoopSettings(_Section):
     max_height_mm: float = knob(0.15, "mm", "lines that lie farther off the scanned surface say that it has changed", "", 0)
     accept_um: float = knob(150.0, "um", "guidance whose lines land farther than this from the asked ones (p95) is not as it should be", "", 1)
     look_s: float = knob(0.5, "s", "pause between two looks at the specimen while guidance is shown", "", 0)
+    lease_s: float = knob(0.25, "s", "the loop that shows guidance must come round within this, or it goes dark", "", 0.02, 2)
     patience_s: float = knob(10.0, "s", "guidance goes dark if nobody could look at the specimen for so long", "", 0.1)
     exposure_us: int = knob(16000, "us", "exposure of the pictures in which lines are looked for", "", 10, 10_000_000)
 
@@ -325,7 +326,7 @@ class GuardSettings(_Section):
     """The watchdog that turns the projector dark (IV-D)."""
 
     beat_ms: float = knob(10.0, "ms", "from one sign of life to the next, each way", "", 1, 40)
-    deadline_ms: float = knob(40.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
+    deadline_ms: float = knob(50.0, "ms", "without a sign for so long, the other side makes dark; what is left of 100 ms is for a busy machine", "", 5, 80)
     lease_s: float = knob(2.0, "s", "for so long at most the owner lets a thread beat for it while it is busy", "", 0.02, 60)
     start_s: float = knob(20.0, "s", "the watchdog must be ready in this time", "", 0.1, 600)
 

@@ -26,6 +26,9 @@ class Guard(Protocol):
     def beat(self) -> None:
         """Somebody is there. Raises DeviceLostError once the projector was made dark."""
 
+    def lease(self, seconds: float) -> None:
+        """Somebody will be there again within `seconds`; it beats by itself till then."""
+
 
 @dataclass(frozen=True, eq=False)
 class Projected:
@@ -99,7 +102,7 @@ def hold(
     last = time.monotonic()
     try:
         while True:
-            guard.beat()
+            guard.lease(s.loop.lease_s)
             now = verdicts[-1]
             if failed:
                 return Projected("lost", f"the specimen can no longer be watched: {failed[0]}", tuple(verdicts))
