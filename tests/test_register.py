@@ -211,4 +211,6 @@ def test_motions_over_seeds_and_specimens() -> None:
             assert np.linalg.norm(e[3:]) < 0.05
             z.append(e / np.sqrt(np.diag(found.covariance)))
     assert failed <= 1
-    assert 0.3 < float(np.sqrt(np.mean(np.square(z)))) < 3
+    spread = float(np.sqrt(np.mean(np.square(z))))
+    print(f"motions: {failed} of 30 refused, error over sigma {spread:.2f}")
+    assert 0.3 < spread < 3
