@@ -14,11 +14,12 @@ import pytest
 from fringescope import capture, cli, geometry, guide, patterns, pipeline, store
 from fringescope.devices import simulated
 from fringescope.devices.base import Station
+from fringescope.devices.watchdog import Guard
 from fringescope.errors import DeviceError, DeviceLostError
-from fringescope.pipeline import closing, guidance, projecting, selftest
+from fringescope.pipeline import closing, guidance, projecting, selftest, watching
 from fringescope.settings import Settings, from_dict
-from fringescope.twin import optics, shapes
-from fringescope.types import Guidelines, Rig, Scan, Standing, Stroke, Watched
+from fringescope.twin import changes, optics, shapes
+from fringescope.types import Guidelines, Pose, Rig, Scan, Standing, Stroke, Watched
 from tests.guide_scenes import to_line
 
 S = Settings()
@@ -208,6 +209,12 @@ class Beats:
     def __init__(self, lost_after: int | None = None) -> None:
         self.count, self.lost_after = 0, lost_after
 
+    def __enter__(self) -> Beats:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
     def beat(self) -> None:
         self.count += 1
         if self.lost_after is not None and self.count > self.lost_after:
@@ -237,7 +244,7 @@ def holding(station: Station, made: Any, looks: list[Any], guard: Beats, seconds
     end = time.monotonic() + seconds
     s = from_dict({"loop": {"look_s": 0.05, "patience_s": 0.4}}, S)
     dashed = replace(made, image=made.image // 2)
-    ended = projecting.hold(station, guard, made, dashed, look, lambda: time.monotonic() > end, s)
+    ended = projecting.hold(station, lambda: guard, made, dashed, look, lambda: time.monotonic() > end, s)
     assert station.projector.shown is None
     return ended, shown
 
@@ -280,10 +287,40 @@ def test_a_look_that_never_ends_makes_dark(domed: Any) -> None:
 
     s = from_dict({"loop": {"look_s": 0.01, "patience_s": 0.3}}, S)
     begun = time.monotonic()
-    ended = projecting.hold(station, Beats(), made, made, look, lambda: False, s)
+    ended = projecting.hold(station, Beats, made, made, look, lambda: False, s)
     assert ended.ended == "lost"
     assert "no look at the specimen" in ended.why
     assert time.monotonic() - begun < 2.5
+
+
+def test_a_specimen_that_moves_under_the_lines_makes_dark(domed: Any) -> None:
+    """With the real watchdog and the real look: the specimen is moved by half a millimetre while guidance is shown."""
+    station, scan, tissue = domed
+    stroke = replace(drawn(station.rig, station.world.scene.shapes, 6, 1)[0][0], color=(255, 255, 255))
+    made = guidance.project_guidance(Guidelines((stroke,)), tissue, S)
+    masks, before, heard = projecting.lit_masks(made, tissue), station.world.scene, []
+    after = changes.moved(before, Pose(np.eye(3), np.array([0.5, 0, 0])))
+    shapes.trace(after.shapes, np.array([0, 0, 400.0]), np.array([[0, 0, -1.0]]))  # builds its tree of triangles now
+
+    def look() -> Watched:
+        return watching.watch(station, scan.grids, scan.pictures, station.rig, S, masks=masks)
+
+    def tell(found: Watched) -> None:
+        heard.append((found.verdict, station.projector.shown is not None))
+        if len(heard) == 2:
+            station.world.change(after)
+
+    slow = from_dict({"loop": {"patience_s": 60.0}}, S)
+    end = time.monotonic() + 60
+    try:
+        ended = projecting.hold(station, lambda: Guard(station.projector, S.guard), made, made, look,
+                                lambda: time.monotonic() > end, slow, tell)  # fmt: skip
+    finally:
+        station.world.change(before)
+    assert station.projector.shown is None
+    assert ended.ended == "stale", ended.why
+    assert heard[:2] == [(Standing.VALID, False), (Standing.VALID, True)]
+    assert heard[-1] == (Standing.STALE, True)
 
 
 def test_masks_hold_what_the_lines_change(domed: Any) -> None:

@@ -140,9 +140,9 @@ def _project(
     def stop() -> bool:
         return INTERRUPTED.is_set() or (end is not None and time.monotonic() > end)
 
-    with registry.open_station(uri) as station, Guard(station.projector, s.guard) as guard:
+    with registry.open_station(uri) as station:
         ended = projecting.hold(
-            station, guard, made, dashed,
+            station, lambda: Guard(station.projector, s.guard), made, dashed,
             lambda: watching.watch(station, stored.grids, pictures, tissue.rig, s, noise=stored.noise(), masks=masks),
             stop, s, lambda v: say(f"{v.verdict.value}: {v.why}"),
         )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -56,7 +57,7 @@ def lit_masks(guidance: Guidance, tissue: guide.Tissue) -> dict[str, Bool]:
 
 def hold(
     station: Station,
-    guard: Guard,
+    guarded: Callable[[], AbstractContextManager[Guard]],
     guidance: Guidance,
     dashed: Guidance,
     look: Callable[[], Watched],
@@ -67,9 +68,9 @@ def hold(
     """Shows guidance until `stop` says so, or until it is no longer true. The projector is dark afterwards, whatever.
 
     `look` compares what is seen with the scan (`watching.watch`, with the masks of `lit_masks`): before anything is
-    shown, and again and again meanwhile, in a thread beside the beats of the `guard`. VALID: the guidance. SUSPECT:
-    `dashed`, the same in dashes. STALE, a look that fails, or none for `watch.patience_s`: dark. `tell` hears every
-    verdict.
+    shown, and again and again meanwhile, in a thread beside the beats of the guard, which starts when something is to
+    be shown. VALID: the guidance. SUSPECT: `dashed`, the same in dashes. STALE, a look that fails, or none for
+    `loop.patience_s`: dark. `tell` hears every verdict.
     """
     s = settings or Settings()
     verdicts: list[Watched] = []
@@ -101,26 +102,32 @@ def hold(
     shown: Standing | None = None
     last = time.monotonic()
     try:
-        while True:
-            guard.lease(s.loop.lease_s)
-            now = verdicts[-1]
-            if failed:
-                return Projected("lost", f"the specimen can no longer be watched: {failed[0]}", tuple(verdicts))
-            if now.verdict is Standing.STALE:
-                return Projected("stale", now.why, tuple(verdicts))
-            if time.monotonic() - last > s.loop.patience_s:
-                return Projected("lost", f"no look at the specimen for {s.loop.patience_s:g} s", tuple(verdicts))
-            if stop():
-                return Projected("stopped", "as was asked", tuple(verdicts))
-            if now.verdict is not shown:
-                image = (guidance if now.verdict is Standing.VALID else dashed).image
-                station.projector.show(image if station.projector.info.colours else np.asarray(image.max(axis=2)))
-                shown = now.verdict
-                if not watcher.is_alive():
-                    watcher.start()
-            time.sleep(1e-3 * s.guard.beat_ms)
+        with guarded() as guard:
+            try:
+                while True:
+                    guard.lease(s.loop.lease_s)
+                    now = verdicts[-1]
+                    if failed:
+                        why = f"the specimen can no longer be watched: {failed[0]}"
+                        return Projected("lost", why, tuple(verdicts))
+                    if now.verdict is Standing.STALE:
+                        return Projected("stale", now.why, tuple(verdicts))
+                    if time.monotonic() - last > s.loop.patience_s:
+                        why = f"no look at the specimen for {s.loop.patience_s:g} s"
+                        return Projected("lost", why, tuple(verdicts))
+                    if stop():
+                        return Projected("stopped", "as was asked", tuple(verdicts))
+                    if now.verdict is not shown:
+                        image = (guidance if now.verdict is Standing.VALID else dashed).image
+                        grey = not station.projector.info.colours
+                        station.projector.show(np.asarray(image.max(axis=2)) if grey else image)
+                        shown = now.verdict
+                        if not watcher.is_alive():
+                            watcher.start()
+                    time.sleep(1e-3 * s.guard.beat_ms)
+            finally:
+                station.projector.dark()
     finally:
-        station.projector.dark()
         over.set()
         if watcher.is_alive():
             watcher.join(s.loop.patience_s)

@@ -22,7 +22,7 @@ from fringescope.twin.scene import Scene
 from fringescope.twin.shapes import Hits, lit, trace
 from fringescope.types import F32, F64, U8, AnyArray, Bool, Camera, PixelFormat
 
-TILE = 150_000  #: rays traced at a time
+TILE = 1 << 14  #: rays that are traced at a time: short enough to let other threads of the interpreter have a turn
 MIRROR_MIN = 2e-4  #: mirrored light below this share of a white surface's is left out
 MIRROR_REACH = 60.0  #: mm; what is mirrored from farther away is left out
 MOST_BLUR = 10.0  #: plane units; light is not blurred more than this
