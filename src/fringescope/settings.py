@@ -254,7 +254,7 @@ class WatchSettings(_Section):
     min_surface: float = knob(0.5, "", "share of a tile that must have points of the scan", "", 0, 1)
     min_texture: float = knob(0.05, "", "share of the surface whose texture must tell shifts; else SUSPECT", "", 0, 1)
     min_judged: float = knob(0.6, "", "share of that which must be seen again; else SUSPECT", "", 0, 1)
-    max_light: float = knob(0.08, "", "places whose brightness changed by more than this share, against the whole picture's, and by max_light_factor times what is usual in it, are SUSPECT: covered, cut or pressed in", "", 0.001)
+    max_light: float = knob(0.04, "", "places whose brightness changed by more than this share, against the whole picture's, and by max_light_factor times what is usual in it, are SUSPECT: covered, cut or pressed in", "", 0.001)
     max_light_factor: float = knob(12.0, "", "see max_light: a film that dries changes a little everywhere", "", 1)
     max_light_ever: float = knob(0.5, "", "a place that changed by more than this is never as it was scanned", "", 0.001)
     max_gain: float = knob(1.6, "", "pictures brighter or darker than the scan's by more than this factor are of another light or exposure", "", 1.01)
