@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ import pytest
 
 from fringescope import cli, export, geometry, guide, store
 from fringescope.errors import FormatError, GuidanceError
-from fringescope.pipeline import guidance
+from fringescope.pipeline import carrying, guidance
 from fringescope.settings import Settings
 from fringescope.store.guidelines import parse_colour
-from fringescope.types import Fill, Guidelines, Rig, Side, Stroke, StrokeKind
+from fringescope.types import Fill, Guidelines, Pose, Rig, Side, Stroke, StrokeKind
 from tests.guide_scenes import to_line
 
 S = Settings()
@@ -212,6 +213,77 @@ def test_verify_closes_the_loop_on_the_simulated_instrument(
     assert told["median_um"] < 40
     assert told["p95_um"] < 120
     assert (tmp_path / "p-camera2-landed.png").exists()
+
+
+# --------------------------------------------------------------------------------------------------------- carried over
+
+
+def test_strokes_are_carried_to_where_the_tissue_went(scanned: Path) -> None:
+    scan, rig = store.read_scan(scanned / "scan"), store.read_rig(scanned / "capture" / "truth" / "rig.json")
+    assert scan.surface is not None
+    tissue = guidance.tissue_of(scan.grids, export.read_glb(scan.surface), rig, S)
+    before = export.read_ply(scan.cloud)
+    turn = cv2.Rodrigues(np.array([0.0, 0.0, np.radians(2.0)]))[0]
+    T = Pose(turn, np.array([1.5, -0.8, 0.2]))
+    after = replace(
+        before,
+        xyz=geometry.transform(T, before.xyz).astype(np.float32),
+        normals=(before.normals.astype(np.float64) @ T.R.T).astype(np.float32),
+    )
+    line = Stroke("cut-1", camera="camera1", pixels=np.array(ON_TISSUE, float), width_mm=0.6)
+    ring = Stroke("ring", StrokeKind.CIRCLE, camera="camera1", pixels=np.array(ON_TISSUE[:1], float), radius_mm=3)
+    off = Stroke("off", camera="camera1", pixels=np.array([[-50.0, -50], [-60, -70]]))
+    found = carrying.carry_over(Guidelines((line, ring, off)), tissue, before, after, rig, S)
+    assert found.guidelines.strokes[0].id == "cut-1"
+    assert list(found.guidelines.refused) == ["off"]
+    assert found.registration.shift_mm == pytest.approx(1.7, abs=0.3)
+    here = guide.place(line, tissue, S.guide)[0].traces[0].xyz
+    want = geometry.transform(T, here[np.isfinite(here).all(1)])
+    got = found.guidelines.strokes[0].points
+    assert to_line(got, want).max() < 0.02
+    assert found.expected_error_um["cut-1"] < 100
+    assert found.guidelines.strokes[0].width_mm == 0.6
+
+
+def test_the_verb_offers_and_the_operator_decides(
+    scanned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = str(scanned / "capture" / "truth" / "rig.json")
+    again = ["reconstruct", str(scanned / "capture"), "--rig", rig, "--out", str(tmp_path / "again")]
+    assert cli.run([*again, "--set", "fuse.agree_mm=0.06"]) == 0
+    old = store.read_scan(scanned / "scan").document["hash"]
+    g = write(tmp_path / "g.json", [{**LINE, "pixels": ON_TISSUE}], scan=old)
+    scans = [str(scanned / "scan"), str(tmp_path / "again")]
+    to = ["carry", *scans, str(g), "--rig", rig, "--out", str(tmp_path / "n.json")]
+    assert cli.run(to) == 0
+    assert "the specimen moved by 0.00 mm" in capsys.readouterr().out
+    carried = store.read_guidelines(tmp_path / "n.json")
+    assert carried.scan == store.read_scan(tmp_path / "again").document["hash"]
+    assert carried.strokes[0].world_mm is not None
+    assert (carried.strokes[0].width_mm, carried.strokes[0].color) == (0.6, (255, 48, 48))
+    args = ["guide", str(tmp_path / "again"), str(tmp_path / "n.json"), "--rig", rig, "--out", str(tmp_path / "p.png")]
+    assert cli.run([*args, "--no-preview"]) == 0
+    assert cli.run([*args[:2], str(g), *args[3:], "--force"]) == 1  # the old ones do not fit the new scan
+    assert "carry them over" in capsys.readouterr().err
+    assert cli.run(to) == 1  # it is there already
+    missing = write(tmp_path / "m.json", [{**LINE, "pixels": [[-50, -50], [-60, -70]]}])
+    assert cli.run([*to[:3], str(missing), *to[4:6], "--out", str(tmp_path / "o.json")]) == 1
+    assert "nothing can be carried over" in capsys.readouterr().err
+
+
+def test_guidelines_are_written_as_they_are_read(tmp_path: Path) -> None:
+    strokes = [
+        {**LINE, "id": "r", "kind": "region", "pixels": [[1, 2], [3, 4], [5, 1]], "fill": "hatch", "spacing_mm": 1.5},
+        {"id": "o", "kind": "offsets", "world_mm": [[0, 0, 1], [5, 0, 1]], "count": 3, "side": "both", "width_px": 2},
+        {"id": "t", "kind": "text", "world_mm": [[0, 0, 1]], "text": "margin", "size_mm": 2.5, "color": "#102030"},
+    ]
+    first = store.read_guidelines(write(tmp_path / "a.json", strokes, rig="sha256:2"))
+    store.write_json(tmp_path / "b.json", store.guidelines_document(first))
+    second = store.read_guidelines(tmp_path / "b.json")
+    assert (second.rig, second.scan) == ("sha256:2", None)
+    for a, b in zip(first.strokes, second.strokes, strict=True):
+        for f in fields(Stroke):
+            assert np.array_equal(getattr(a, f.name), getattr(b, f.name)), f.name
 
 
 # ----------------------------------------------------------------------------------------------------- rendered tissue

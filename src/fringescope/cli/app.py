@@ -64,6 +64,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "guiding",
         "Guidelines to the picture that the projector shows, and what of them is visible and how exact.",
     ),
+    "carry": (
+        "guiding",
+        "Guidelines of one scan carried over to the next by registration, for the operator to look at and decide.",
+    ),
     "selftest": (
         "guiding",
         "Projects a cross grid on the calibration board and measures where its lines land: after each calibration.",

@@ -1,10 +1,12 @@
-"""Verbs that bring an expert's strokes back onto the tissue, and prove where: guide, selftest."""
+"""Verbs that bring an expert's strokes back onto the tissue, and prove where: guide, carry, selftest."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -170,6 +172,61 @@ def summary(made: Guidance, landings: Sequence[Landing] = ()) -> list[str]:
         if g.stroke.id in landed:
             out.append(f"  landed: {landing_caption(landed[g.stroke.id])}")
     return out
+
+
+@app.command()
+def carry(
+    old: Annotated[Path, typer.Argument(help="The scan that the guidelines were drawn on.")],
+    new: Annotated[Path, typer.Argument(help="The scan made since, of the same specimen and rig.")],
+    guidelines: Annotated[Path, typer.Argument(help="The strokes: a file of format fringescope-guidelines.")],
+    rig: Annotated[Path, typer.Option(help="The rig.json of both scans.")],
+    out: Annotated[Path, typer.Option(help="The guidelines for the new scan, a JSON file, in mm.")],
+    settings: SettingsFile = None,
+    set_: SetOption = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Guidelines of one scan carried over to the next by registration, for the operator to look at and decide.
+
+    Nothing is projected: preview the new file with `guide`, and use it if it is right.
+    """
+    from fringescope import export, store
+    from fringescope.pipeline import carrying
+    from fringescope.pipeline import guidance as recipe
+
+    s = load_settings(settings, set_)
+    asked = store.read_guidelines(existing(guidelines, "a file with guidelines"))
+    with Progress() as progress:
+        r, was = store.read_rig(rig), store.read_scan(old)
+        now = store.read_scan(new, grids=False)
+        store.check_pair(was, now, store.hash_rig(rig))
+        recipe.check_bound(asked, str(was.document.get("hash")), store.hash_rig(rig))
+        if was.surface is None:
+            raise EmptyResultError(f"{old}: the scan has no surface, so nothing was drawn on it")
+        tissue = recipe.tissue_of(was.grids, export.read_glb(was.surface), r, s)
+        clouds = [export.read_ply(x.cloud) for x in (was, now)]
+        found = progress.run("carrying over", lambda: carrying.carry_over(asked, tissue, clouds[0], clouds[1], r, s))
+    if not found.guidelines.strokes:
+        why = "; ".join(f"{k}: {v}" for k, v in found.guidelines.refused.items())
+        raise EmptyResultError(f"nothing can be carried over; {why or 'there are no strokes'}")
+    g = found.registration
+    told = {
+        "moved_mm": g.shift_mm, "turned_rad": g.turn_rad, "residual_um": 1e3 * g.rms_mm, "unchanged": g.inliers,
+        "expected_error_um": found.expected_error_um, "refused": found.guidelines.refused, "words": g.words,
+    }  # fmt: skip
+    bound = replace(found.guidelines, scan=now.document.get("hash"), rig=store.hash_rig(rig))
+    with store.new_file(out, force=force) as file:
+        store.write_json(file, store.guidelines_document(bound, {"carried_over": told}))
+    worst = max(found.expected_error_um.values())
+    lines = [
+        f"{out}: {len(bound.strokes)} strokes; the specimen moved by {g.shift_mm:.2f} mm and "
+        f"{math.degrees(g.turn_rad):.2f} degrees, {g.inliers:.0%} of it fits within {1e3 * g.rms_mm:.0f} um (rms); "
+        f"expected error up to {worst:.0f} um",
+        *g.words,
+        *(f"{k}: left behind: {v}" for k, v in bound.refused.items()),
+        "look at it before you use it: fringescope guide " + f"{new} {out} --rig {rig} --out pattern.png",
+    ]
+    emit({"guidelines": str(out), **told}, json, lines)
 
 
 @app.command()

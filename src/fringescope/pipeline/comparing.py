@@ -51,12 +51,8 @@ def compare_scans(
     tell = progress or _silent
     up = upwards(after, rig)
     tell("telling the specimens from the substrate", 0.0)
-    found = [specimen.find(c.xyz, c.normals, c.sigma, up, s.specimen) for c in (before, after)]
-    grounded = bool(found[0].pieces and found[1].pieces)
-    on_before, on_after = (
-        specimen.on_specimen(f, c.xyz, c.sigma) if grounded else None
-        for f, c in zip(found, (before, after), strict=True)
-    )
+    found, (on_before, on_after) = _specimens(before, after, up, s)
+    grounded = on_before is not None
     tell("registering", 0.2)
     if moved:
         placed = register.register(
@@ -86,6 +82,23 @@ def compare_scans(
                      + "): all that both scans hold was compared")  # fmt: skip
     tell("done", 1.0)
     return Comparison(change, placed, found[0], found[1], tuple(carried), tuple(errors), distances, tuple(words))
+
+
+def laid(before: Cloud, after: Cloud, rig: Rig | None, s: Settings) -> register.Registration:
+    """The motion that lays the specimen of one cloud on that of another, whatever the tray did. Raises as above."""
+    _, (old, new) = _specimens(before, after, upwards(after, rig), s)
+    return register.register(register.patch_of(before, old), register.patch_of(after, new), s.register)
+
+
+def _specimens(
+    before: Cloud, after: Cloud, up: F64, s: Settings
+) -> tuple[list[specimen.Found], tuple[Bool | None, Bool | None]]:
+    """The specimens of both clouds, and which points are theirs: None where either is not told from its substrate."""
+    found = [specimen.find(c.xyz, c.normals, c.sigma, up, s.specimen) for c in (before, after)]
+    if not (found[0].pieces and found[1].pieces):
+        return found, (None, None)
+    old, new = (specimen.on_specimen(f, c.xyz, c.sigma) for f, c in zip(found, (before, after), strict=True))
+    return found, (old, new)
 
 
 def upwards(cloud: Cloud, rig: Rig | None) -> F64:

@@ -32,7 +32,8 @@ def check_bound(guidelines: Guidelines, scan: str, rig: str) -> None:
     for what, asked, came in (("scan", guidelines.scan, scan), ("rig", guidelines.rig, rig)):
         if asked is not None and asked != came:
             raise GuidanceError(
-                f"the guidelines belong to {what} {asked[:19]}.., this is {came[:19]}..; draw them anew on this {what}"
+                f"the guidelines belong to {what} {asked[:19]}.., this is {came[:19]}..; "
+                "draw them anew, or carry them over (fringescope carry)"
             )
 
 

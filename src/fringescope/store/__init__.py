@@ -14,7 +14,12 @@ from fringescope.store.capture import (
 )
 from fringescope.store.comparison import check_pair, put_comparison, read_strokes
 from fringescope.store.files import new_file, new_folder, write_json
-from fringescope.store.guidelines import parse_guidelines, pattern_document, read_guidelines
+from fringescope.store.guidelines import (
+    guidelines_document,
+    parse_guidelines,
+    pattern_document,
+    read_guidelines,
+)
 from fringescope.store.images import Images, write_png, write_tiff
 from fringescope.store.response import read_response, response_document
 from fringescope.store.rig import hash_rig, read_rig, rig_document, write_rig
@@ -50,6 +55,7 @@ __all__ = [
     "calibration_document",
     "check_pair",
     "check_rig",
+    "guidelines_document",
     "hash_capture",
     "hash_rig",
     "lost",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -66,6 +67,29 @@ def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
         except GuidanceError as e:
             refused[name] = str(e)
     return Guidelines(tuple(strokes), doc.get("scan"), doc.get("rig"), refused)
+
+
+def guidelines_document(guidelines: Guidelines, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Guidelines as their file; `extra` adds keys."""
+    bound = {k: v for k, v in (("scan", guidelines.scan), ("rig", guidelines.rig)) if v is not None}
+    strokes = [_written(x) for x in guidelines.strokes]
+    return {"format": FORMAT, "version": VERSION, **bound, "strokes": strokes, **plain(extra or {})}
+
+
+def _written(x: Stroke) -> dict[str, Any]:
+    out: dict[str, Any] = {"id": x.id, "kind": x.kind.value}
+    if x.pixels is not None:
+        out |= {"camera": x.camera, "pixels": np.round(x.pixels, 3).tolist()}
+    else:
+        out["world_mm"] = np.round(x.points, 4).tolist()
+    usual = {f.name: f.default for f in dataclasses.fields(Stroke)}
+    for key in ("width_mm", "width_px", "closed", "spacing_mm", "count", "radius_mm", "head_mm", "text", "size_mm"):
+        if getattr(x, key) != usual[key]:
+            out[key] = getattr(x, key)
+    for key in ("fill", "side"):
+        if getattr(x, key) is not usual[key]:
+            out[key] = getattr(x, key).value
+    return {**out, "color": "#{:02x}{:02x}{:02x}".format(*x.color)}
 
 
 def _stroke(name: str, d: Mapping[str, Any]) -> Stroke:
