@@ -240,7 +240,7 @@ def test_a_mosaic_is_drawn_without_its_pattern():
     image = np.full((100, 140), 100, np.float32)
     image[::2, ::2] = 30
     image[:, 70:] *= 2
-    grey = report.sighting._grey(image)[4:-4]
+    grey = report.sighting.grey_picture(image)[4:-4]
     assert np.ptp(grey[:, 5:60]) < 8
     assert grey[:, 80:].mean() > grey[:, 5:60].mean() + 50
 
