@@ -24,7 +24,7 @@ from fringescope import examination
 from fringescope.errors import FormatError
 from fringescope.settings import ExaminationSettings
 from fringescope.types import examination as t
-from fringescope.types.examination import Phase, Role, Validity
+from fringescope.types.examination import Phase, Role, Standing
 
 S = ExaminationSettings(verdict_s=5.0, suspect_s=10.0, arm_s=60.0, max_strokes=6)
 SECOND = 1_000_000_000
@@ -92,7 +92,7 @@ class Room:
     def begin(self) -> Room:
         self.ok("box", t.ScanTaken("scan1", "rig1"))
         self.ok("box", t.Guarded())
-        self.ok("box", t.Watched("scan1", Validity.VALID))
+        self.ok("box", t.Watched("scan1", Standing.VALID))
         return self
 
     def draw(self, who: str = "ann", strokes: tuple[tuple[str, str], ...] = STROKES) -> Room:
@@ -170,7 +170,7 @@ def test_only_the_operator_confirms_arms_and_starts(who: str) -> None:
     r.arm()
     r.no(who, t.Start(1, v.pattern), "not for the")
     r.start()
-    r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+    r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     r.no(who, t.Acknowledge(r.state.suspect_ns), "not for the")
 
 
@@ -180,7 +180,7 @@ def test_people_do_not_speak_for_the_instrument(who: str) -> None:
     r.submit()
     for what in (
         t.ScanTaken("s", "r"), t.RigChanged("r"), t.Checked(1, r.version(1).content, "p", "d"), t.Previewed(1, "p"),
-        t.Watched("scan1", Validity.VALID), t.Guarded(), t.GuardLost("x"), t.DeviceLost("x"), t.DeviceBack("x"),
+        t.Watched("scan1", Standing.VALID), t.Guarded(), t.GuardLost("x"), t.DeviceLost("x"), t.DeviceBack("x"),
         t.Expired(t.Term.ARM),
     ):  # fmt: skip
         r.no(who, what, "not for the")
@@ -283,7 +283,7 @@ def test_nothing_begins_without_a_scan() -> None:
     r.no("ann", t.Put("s1", "line", ""), "printable")
     r.no("ann", t.Put("s1", "line", "scan1"), "none")
     r.no("ann", t.Submit(STROKES, "scan1", "rig1"), "none")
-    r.no("box", t.Watched("scan1", Validity.VALID), "none")
+    r.no("box", t.Watched("scan1", Standing.VALID), "none")
     assert examination.shown(r.state) is None
 
 
@@ -362,7 +362,7 @@ DOUBT: dict[str, tuple[t.What, Phase]] = {
     "another scan": (t.ScanTaken("scan2", "rig1"), Phase.STALE),
     "the same scan by another rig": (t.ScanTaken("scan1", "rig2"), Phase.STALE),
     "another rig": (t.RigChanged("rig2"), Phase.STALE),
-    "moved": (t.Watched("scan1", Validity.STALE), Phase.STALE),
+    "moved": (t.Watched("scan1", Standing.STALE), Phase.STALE),
     "no heartbeat": (t.GuardLost("no heartbeat for 60 ms"), Phase.STOPPED),
     "a device": (t.DeviceLost("camera2"), Phase.STOPPED),
 }
@@ -397,9 +397,9 @@ def test_doubt_makes_dark_and_bars_the_way_back(name: str, armed: bool) -> None:
 
 def test_after_a_stale_verdict_only_a_new_scan_helps() -> None:
     r = room().to_light()
-    r.ok("box", t.Watched("scan1", Validity.STALE, "moved by 0.3 mm"))
+    r.ok("box", t.Watched("scan1", Standing.STALE, "moved by 0.3 mm"))
     assert "moved by 0.3 mm" in r.version(1).why
-    r.no("box", t.Watched("scan1", Validity.VALID), "stale for good")
+    r.no("box", t.Watched("scan1", Standing.VALID), "stale for good")
     r.no("ann", t.Submit(STROKES, "scan1", "rig1"), "scan again")
     r.ok("box", t.ScanTaken("scan2", "rig1"))
     r.no("ann", t.Submit(STROKES, "scan2", "rig1"), "drawn on scan scan1")
@@ -411,28 +411,28 @@ def test_after_a_stale_verdict_only_a_new_scan_helps() -> None:
     n = r.submit("olga", (("c1", "line moved"),))
     r.check(n).preview(n)
     r.no("olga", t.Arm(n, r.version(n).content, f"picture{n}"), "was not looked at")
-    r.ok("box", t.Watched("scan2", Validity.VALID))
+    r.ok("box", t.Watched("scan2", Standing.VALID))
     r.arm(n).start(n)
     r.no("olga", t.CarryOver(n, (("c2", "x"),), "scan2", 1.0), "only what is stale")
 
 
 def test_a_suspect_specimen_gets_dashed_lines_and_the_operator_is_asked() -> None:
     r = room().to_light()
-    out = r.ok("box", t.Watched("scan1", Validity.SUSPECT, "0.2 mm"))
+    out = r.ok("box", t.Watched("scan1", Standing.SUSPECT, "0.2 mm"))
     assert r.lit == (1, "dashes1")
     assert any(isinstance(e, t.Warn) for e in out.effects)
     since = r.state.suspect_ns
-    assert r.ok("box", t.Watched("scan1", Validity.SUSPECT)).effects == ()  # said once
+    assert r.ok("box", t.Watched("scan1", Standing.SUSPECT)).effects == ()  # said once
     r.no("olga", t.Acknowledge(since + 1), "no such warning")
     r.ok("olga", t.Acknowledge(since))
     r.now += int(11 * SECOND)
-    r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+    r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     assert examination.due(r.state, r.now, S) == ()
     assert r.lit == (1, "dashes1")
-    r.ok("box", t.Watched("scan1", Validity.VALID))
+    r.ok("box", t.Watched("scan1", Standing.VALID))
     assert r.lit == (1, "picture1")
     r.now += 1
-    r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+    r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     r.no("olga", t.Acknowledge(since), "no such warning")  # an old yes is no yes to this
     assert not r.state.acknowledged
 
@@ -441,7 +441,7 @@ def test_a_suspect_specimen_starts_nothing_unasked() -> None:
     r = room().draw()
     r.submit()
     r.check().preview().arm()
-    r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+    r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     r.no("olga", t.Start(1, "picture1"), "may have moved")
     r.ok("olga", t.Acknowledge(r.state.suspect_ns))
     r.start()
@@ -471,10 +471,10 @@ def test_a_verdict_grows_old() -> None:
 
 def test_no_answer_to_a_warning_is_no() -> None:
     r = room().to_light()
-    r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+    r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     for _ in range(4):
         r.now += int(2.6 * SECOND)
-        r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+        r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     expire(r, t.Term.ACKNOWLEDGEMENT)
     assert (r.lit, r.phase()) == (None, Phase.STOPPED)
 
@@ -484,7 +484,7 @@ def test_armed_for_too_long_must_be_armed_again() -> None:
     r.submit()
     r.check().preview().arm()
     r.now += int(60.5 * SECOND)
-    r.ok("box", t.Watched("scan1", Validity.VALID))
+    r.ok("box", t.Watched("scan1", Standing.VALID))
     r.no("olga", t.Start(1, "picture1"), "arm it again")
     expire(r, t.Term.ARM)
     assert r.phase() is Phase.PREVIEWED
@@ -549,7 +549,7 @@ def test_events_without_sender_or_number_are_refused() -> None:
 
 def test_everything_goes_through_json_and_back() -> None:
     r = room().to_light()
-    r.ok("box", t.Watched("scan1", Validity.SUSPECT))
+    r.ok("box", t.Watched("scan1", Standing.SUSPECT))
     r.ok("ann", t.Stop(why="a hand"))
     for value in (*r.log, r.state, r.last, *(e for e in r.last.effects)):
         assert examination.from_dict(json.loads(json.dumps(examination.to_dict(value)))) == value
@@ -627,7 +627,7 @@ def lit_by_the_log(log: list[t.Event]) -> tuple[int, str] | None:
         return (
             isinstance(w, (t.GuardLost, t.DeviceLost, t.ScanTaken, t.RigChanged))
             or (isinstance(w, t.Stop) and (w.version in (None, n) or not 1 <= w.version <= submitted))
-            or (isinstance(w, t.Watched) and w.validity is Validity.STALE)
+            or (isinstance(w, t.Watched) and w.validity is Standing.STALE)
             or (isinstance(w, t.Expired) and w.term is not t.Term.ARM)
         )
 
@@ -687,13 +687,13 @@ def lit_by_the_log(log: list[t.Event]) -> tuple[int, str] | None:
     assert w is not None
     assert w > k
     assert (log[i].at_ns - log[w].at_ns) <= S.verdict_s * SECOND
-    if log[w].what.validity is Validity.SUSPECT:
+    if log[w].what.validity is Standing.SUSPECT:
         first = w
-        while (p := before(first, is_a(t.Watched))) is not None and p > k and log[p].what.validity is Validity.SUSPECT:
+        while (p := before(first, is_a(t.Watched))) is not None and p > k and log[p].what.validity is Standing.SUSPECT:
             first = p
         assert any(isinstance(e.what, t.Acknowledge) and e.role is Role.OPERATOR for e in log[first:i])
     last: Any = log[before(end, is_a(t.Watched))].what
-    return n, check.dashed if last.validity is Validity.SUSPECT else check.pattern
+    return n, check.dashed if last.validity is Standing.SUSPECT else check.pattern
 
 
 EDGES = {
@@ -729,7 +729,7 @@ ANY_WHAT = st.one_of(
     st.builds(t.Start, NUMBERS, WORDS),
     st.builds(t.Acknowledge, st.integers(0, 10**10)),
     st.builds(t.Stop, st.none() | NUMBERS, WORDS),
-    st.builds(t.Watched, WORDS, st.sampled_from(Validity)),
+    st.builds(t.Watched, WORDS, st.sampled_from(Standing)),
     st.just(t.Guarded()),
     st.builds(t.GuardLost, WORDS),
     st.builds(t.DeviceLost, st.sampled_from(["camera1", "projector"])),
@@ -812,7 +812,7 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(answer=st.booleans(), seconds=st.sampled_from([0.0, 4.0, 11.0]))
     @precondition(lambda self: self.room.lit)
     def doubt_while_lit(self, answer: bool, seconds: float) -> None:
-        self.look(Validity.SUSPECT)
+        self.look(Standing.SUSPECT)
         assert self.room.lit
         assert self.room.lit[1].startswith("dashes")
         if answer:
@@ -825,19 +825,19 @@ class AnyOrder(RuleBasedStateMachine):
         for name in self.room.state.lost:
             self.send(self.room.event("box", t.DeviceBack(name)))
         self.send(self.room.event("box", t.Guarded()))
-        if self.room.state.validity is Validity.STALE or not self.room.state.scan:
+        if self.room.state.validity is Standing.STALE or not self.room.state.scan:
             self.scan_again(len(self.room.log), "rig1")
-        self.send(self.room.event("box", t.Watched(self.room.state.scan or "scan1", Validity.VALID)))
+        self.send(self.room.event("box", t.Watched(self.room.state.scan or "scan1", Standing.VALID)))
 
     @rule(
-        validity=st.sampled_from([Validity.VALID, Validity.SUSPECT, Validity.SUSPECT, Validity.SUSPECT, Validity.STALE])
+        validity=st.sampled_from([Standing.VALID, Standing.SUSPECT, Standing.SUSPECT, Standing.SUSPECT, Standing.STALE])
     )
     @precondition(lambda self: self.room.state.scan)
-    def look(self, validity: Validity) -> None:
+    def look(self, validity: Standing) -> None:
         self.send(self.room.event("box", t.Watched(self.room.state.scan, validity)))
 
     @rule()
-    @precondition(lambda self: self.room.state.validity is Validity.SUSPECT)
+    @precondition(lambda self: self.room.state.validity is Standing.SUSPECT)
     def go_on(self) -> None:
         self.send(self.room.event("olga", t.Acknowledge(self.room.state.suspect_ns)))
 

@@ -41,10 +41,10 @@ from fringescope.types.examination import (
     Put,
     Remove,
     Role,
+    Standing,
     Start,
     Stop,
     Submit,
-    Validity,
     Watched,
     What,
 )
@@ -99,7 +99,7 @@ def replay(events: Iterable[Event], settings: ExaminationSettings | None = None)
 
 def _darkens(what: What) -> bool:
     return isinstance(what, (Stop, GuardLost, DeviceLost)) or (
-        isinstance(what, Watched) and what.validity is Validity.STALE
+        isinstance(what, Watched) and what.validity is Standing.STALE
     )
 
 

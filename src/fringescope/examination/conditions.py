@@ -13,8 +13,8 @@ from fringescope.types.examination import (
     GuardLost,
     Phase,
     Show,
+    Standing,
     Term,
-    Validity,
     Version,
     What,
 )
@@ -27,7 +27,7 @@ def shown(state: Examination) -> Show | None:
     """The one picture that belongs on the projector, None = dark."""
     for v in state.versions:
         if v.phase is Phase.PROJECTING:
-            return Show(v.number, v.dashed if state.validity is Validity.SUSPECT else v.pattern)
+            return Show(v.number, v.dashed if state.validity is Standing.SUSPECT else v.pattern)
     return None
 
 
@@ -49,7 +49,7 @@ def due(
     lit = [v for v in state.versions if v.phase in LIT]
     if lit and (now_ns - state.verdict_ns) * NS > s.verdict_s:
         out.append(Expired(Term.VERDICT))
-    waits = state.validity is Validity.SUSPECT and not state.acknowledged
+    waits = state.validity is Standing.SUSPECT and not state.acknowledged
     if waits and any(v.phase is Phase.PROJECTING for v in lit) and (now_ns - state.suspect_ns) * NS > s.suspect_s:
         out.append(Expired(Term.ACKNOWLEDGEMENT))
     if any(v.phase is Phase.ARMED and (now_ns - v.since_ns) * NS > s.arm_s for v in lit):
@@ -75,11 +75,11 @@ def hindrance(state: Examination, version: Version, now_ns: int, settings: Exami
         return f"no answer from {', '.join(state.lost)}; nothing is projected until it is back"
     if not state.guarded:
         return "no watchdog runs; nothing is projected without one"
-    if state.validity is None or state.validity is Validity.STALE:
+    if state.validity is None or state.validity is Standing.STALE:
         seen = "has moved or changed" if state.validity else "was not looked at"
         return f"the specimen {seen} since scan {state.scan}; {'scan again' if state.validity else 'look first'}"
     if (now_ns - state.verdict_ns) * NS > s.verdict_s:
         return f"nobody has looked at the specimen for {(now_ns - state.verdict_ns) * NS:.1f} s; look again"
-    if state.validity is Validity.SUSPECT and not state.acknowledged:
+    if state.validity is Standing.SUSPECT and not state.acknowledged:
         return "the specimen may have moved; the operator must say first whether to go on"
     return ""

@@ -30,11 +30,11 @@ from fringescope.types.examination import (
     Remove,
     RigChanged,
     ScanTaken,
+    Standing,
     Start,
     Stop,
     Submit,
     Term,
-    Validity,
     Version,
     Warn,
     Watched,
@@ -154,7 +154,7 @@ def _submit(state: Examination, w: Submit, event: Event) -> Step:
             f"a guideline for scan {w.scan} and rig {w.rig}; "
             f"the present ones are {state.scan or 'none'} and {state.rig or 'none'}: draw it on that scan"
         )
-    if state.validity is Validity.STALE:
+    if state.validity is Standing.STALE:
         raise RefusalError(f"the specimen has moved or changed since scan {state.scan}; scan again")
     if not w.strokes or len({i for i, _ in w.strokes}) != len(w.strokes):
         raise RefusalError("a guideline without strokes, or with one of them twice; submit each once")
@@ -241,7 +241,7 @@ def _start(state: Examination, w: Start, event: Event, s: ExaminationSettings) -
 
 
 def _acknowledge(state: Examination, w: Acknowledge) -> Examination:
-    if state.validity is not Validity.SUSPECT or w.suspect_ns != state.suspect_ns:
+    if state.validity is not Standing.SUSPECT or w.suspect_ns != state.suspect_ns:
         raise RefusalError("no such warning stands; look at the present one")
     return replace(state, acknowledged=True)
 
@@ -257,19 +257,19 @@ def _stop(state: Examination, w: Stop, event: Event) -> Examination:
 def _watched(state: Examination, w: Watched, event: Event) -> Step:
     if not state.scan or w.scan != state.scan:
         raise RefusalError(f"a verdict on scan {w.scan}; the present one is {state.scan or 'none'}")
-    if state.validity is Validity.STALE:
+    if state.validity is Standing.STALE:
         raise RefusalError(f"scan {state.scan} is stale for good; scan again")
     note = f" ({w.note})" if w.note else ""
-    if w.validity is Validity.STALE:
+    if w.validity is Standing.STALE:
         state = _all_stale(state, event, f"the specimen moved or changed{note}")
         stale = replace(state, validity=w.validity, verdict_ns=event.at_ns, acknowledged=False)
         return stale, (Warn(f"the specimen is not as it was scanned{note}: scan again"),)
     if event.at_ns < state.verdict_ns:
         raise RefusalError("a verdict older than the last one")
     state = replace(state, verdict_ns=event.at_ns)
-    if w.validity is Validity.VALID:
+    if w.validity is Standing.VALID:
         return replace(state, validity=w.validity, acknowledged=False), ()
-    if state.validity is Validity.SUSPECT:
+    if state.validity is Standing.SUSPECT:
         return state, ()
     warn = Warn(f"the specimen may have moved{note}: look, then go on or stop")
     return replace(state, validity=w.validity, suspect_ns=event.at_ns, acknowledged=False), (warn,)

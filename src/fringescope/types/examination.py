@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from fringescope.types.watching import Standing as Standing
+
 
 class Role(Enum):
     """Who says something: only the operator starts, anybody stops."""
@@ -30,14 +32,6 @@ class Phase(Enum):
     STOPPED = "stopped"
     STALE = "stale"
     SUPERSEDED = "superseded"
-
-
-class Validity(Enum):
-    """Whether the specimen still is where, and as, it was scanned."""
-
-    VALID = "valid"
-    SUSPECT = "suspect"
-    STALE = "stale"
 
 
 @dataclass(frozen=True)
@@ -83,7 +77,7 @@ class Examination:
 
     rig: str = ""
     scan: str = ""
-    validity: Validity | None = None  #: of the scan; None: nobody has looked yet
+    validity: Standing | None = None  #: of the scan; None: nobody has looked yet
     verdict_ns: int = 0  #: when somebody looked last
     suspect_ns: int = 0  #: since when it is suspect
     acknowledged: bool = False  #: the operator goes on with what is suspect
@@ -205,7 +199,7 @@ class Watched:
     """Somebody looked whether the specimen still is as in the scan."""
 
     scan: str
-    validity: Validity
+    validity: Standing
     note: str = ""
 
 
