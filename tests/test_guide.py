@@ -366,6 +366,11 @@ def test_dashes_leave_gaps(on_plane: guide.Tissue) -> None:
     g, dashed = one(stroke, on_plane, dashed=True)
     assert 0.4 < dashed.any(2).sum() / whole.any(2).sum() < 0.75  # with their round ends
     assert g.length_mm == pytest.approx(16, rel=0.02)
+    box = np.array([[-5, -4], [5, -4], [5, 4], [-5, 4.0]])
+    solid = np.column_stack([box, np.linalg.norm([0.05, 0.1, 1]) - box @ [0.05, 0.1]])
+    stroke = Stroke("a", StrokeKind.REGION, world_mm=solid, fill=Fill.SOLID, width_mm=0.2)
+    whole, striped = one(stroke, on_plane)[1], one(stroke, on_plane, dashed=True)[1]
+    assert 0.35 < striped.any(2).sum() / whole.any(2).sum() < 0.65
 
 
 def test_colour_is_that_of_the_lamps_and_bounded(on_plane: guide.Tissue) -> None:
@@ -426,8 +431,15 @@ def test_crossing_itself_many_points_and_no_length(on_plane: guide.Tissue) -> No
     g, _ = one(Stroke("knot", StrokeKind.REGION, camera="camera1", fill=Fill.SOLID,
                       pixels=[[60, 50], [100, 70], [100, 50], [60, 70]]), on_plane)  # fmt: skip
     assert g.area_mm2 == pytest.approx(0.5 * 40 * 20 * 0.0625 / np.cos(np.radians(30)), rel=0.25)  # by even and odd
-    g, image = one(Stroke("dot", camera="camera1", pixels=[[80, 60], [80, 60]]), on_plane)
-    assert g.refused is None or not image.any()
+    far = one(Stroke("far", camera="camera1", pixels=[[80, 60], [9e5, 60]]), on_plane)[0]
+    near = one(Stroke("near", camera="camera1", pixels=[[80, 60], [400, 60]]), on_plane)[0]
+    assert sum(len(x) for x in far.segments) == pytest.approx(sum(len(x) for x in near.segments), abs=2)
+    assert to_line(np.concatenate(far.segments), np.concatenate(near.segments)).max() < 0.05
+    noise = np.random.default_rng(0).uniform(0, 100, (100_000, 2))
+    assert "split it" in str(one(Stroke("noise", camera="camera1", pixels=noise), on_plane)[0].refused)
+    for text in ("日本", "a本"):
+        stroke = Stroke("text", StrokeKind.TEXT, world_mm=[[-8, 0, 1.4]], text=text)
+        assert "no letter" in str(one(stroke, on_plane)[0].refused)
 
 
 def test_no_surface_no_guidance() -> None:

@@ -69,6 +69,13 @@ def test_every_kind_is_read(tmp_path: Path) -> None:
         ({"pixels": [[1, 2], [None, 3]]}, "NaN|not numbers"),
         ({"pixels": [[1, 2], {"u": 3}]}, "not numbers"),
         ({"pixels": []}, "shape"),
+        ({"pixels": [["1", "2"], ["3", "4"]]}, "not numbers"),
+        ({"pixels": [[True, False], [False, True]]}, "not numbers"),
+        ({"pixels": [[1, 2], [3, 1e308]]}, "reaches to 1e\\+308"),
+        ({"pixels": [[5, 5], [5, 5]]}, "all its points are the same"),
+        ({"kind": "offsets", "spacing_mm": 100, "count": 100}, "needed at most 200 mm"),
+        ({"kind": "text", "text": "\u200b"}, "printable"),
+        ({"kind": "text", "text": "x" * 101}, "printable"),
         ({"closed": "yes"}, "closed is"),
         ({"count": 2.5}, "count is 2.5"),
         ({"camera": 3}, "camera is 3"),
@@ -89,7 +96,6 @@ def test_a_bad_stroke_is_refused_by_name_and_the_rest_is_read(tmp_path: Path, ch
         ({"format": "fringescope-rig", "version": 1}, "format"),
         ({"format": "fringescope-guidelines", "version": 2, "strokes": []}, "version"),
         ({"format": "fringescope-guidelines", "version": 1}, "needed a list of strokes"),
-        ({"format": "fringescope-guidelines", "version": 1, "strokes": [LINE, LINE]}, "two strokes have the id"),
         ({"format": "fringescope-guidelines", "version": 1, "strokes": [], "scan": 5}, '"scan" is 5'),
     ],
 )
@@ -100,8 +106,10 @@ def test_files_that_are_no_guidelines(tmp_path: Path, doc: Any, words: str) -> N
 
 
 def test_strokes_without_an_id_or_that_are_none(tmp_path: Path) -> None:
-    g = store.read_guidelines(write(tmp_path / "g.json", [5, {**LINE, "id": ""}, LINE]))
-    assert list(g.refused) == ["strokes[0]", "strokes[1]"]
+    names = ["", "two\nlines", "\ud800", "\x1b[31m"]
+    g = store.read_guidelines(write(tmp_path / "g.json", [5, *({**LINE, "id": n} for n in names), LINE, LINE]))
+    assert list(g.refused) == [f"strokes[{i}]" for i in (0, 1, 2, 3, 4, 6)]
+    assert "needed one of its own" in g.refused["strokes[6]"]
     assert len(g.strokes) == 1
     assert parse_colour("Green") == (0, 255, 128)
 

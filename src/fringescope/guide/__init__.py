@@ -115,18 +115,23 @@ def _inside(
 
 
 def _text(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: float) -> tuple[Guided, list[Patch]]:
-    rings, ground = fills.letters(stroke, tissue, s)
+    places, rings, ground = fills.letters(stroke, tissue, s)
     if not ground.any():
         raise GuidanceError("none of the text lies on the measured surface; move it")
     patch = fills.polygons(rings, tissue.rig.projector, tissue.relief)
+    whole = [bool(g.all()) for g in np.split(ground, np.cumsum([len(r) for r in rings])[:-1])]
+    closed = [np.vstack([p, p[:1]]) for p in places]
+    around = [float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in closed]
     hidden: tuple[HiddenPart, ...] = ()
-    if not ground.all():
+    if not all(whole):
         off = np.concatenate(rings)[~ground]
-        hidden = (HiddenPart(off[np.isfinite(off).all(1)], Hidden.HOLE, 0.0),)
+        dark = sum(a for a, w in zip(around, whole, strict=True) if not w)
+        hidden = (HiddenPart(off[np.isfinite(off).all(1)], Hidden.HOLE, dark),)
     notes = () if ground.all() else (f"{1 - ground.mean():.0%} of the text lies beside the measured surface",)
     made = Guided(
-        stroke, hidden=hidden, notes=notes,
-        segments=tuple(np.vstack([r, r[:1]]) for r in rings),
+        stroke, hidden=hidden, notes=notes, length_mm=sum(around),
+        segments=tuple(np.vstack([r, r[:1]]) for r, w in zip(rings, whole, strict=True) if w),
+        lands=tuple(p for p, w in zip(closed, whole, strict=True) if w),
         expected_error_um=1e3 * calibration_mm if calibration_mm else None,
     )  # fmt: skip
     return made, [] if patch is None else [patch]

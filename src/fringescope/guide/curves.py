@@ -99,24 +99,28 @@ def offsets(line: Samples, stroke: Stroke, tissue: Tissue) -> list[Samples]:
     aside = np.cross(direction(base, piece), normal)
     known = np.isfinite(aside).all(1)
     sides = {Side.RIGHT: (1,), Side.LEFT: (-1,), Side.BOTH: (1, -1)}[stroke.side]
-    lines = [
-        _parallel(base[known], piece[known], side * aside[known], k * stroke.spacing_mm, pace, tissue)
-        for k in range(1, stroke.count + 1)
+    lines = {
+        (k, side): line
         for side in sides
-    ]
-    return [line for line in lines if len(line)]
+        for k, line in enumerate(_parallels(base[known], piece[known], side * aside[known], stroke, pace, tissue))
+    }
+    return [lines[key] for key in sorted(lines, key=lambda key: (key[0], -key[1])) if len(lines[key])]
 
 
-def _parallel(base: F64, piece: Any, aside: F64, distance: float, pace: float, tissue: Tissue) -> Samples:
+def _parallels(base: F64, piece: Any, aside: F64, stroke: Stroke, pace: float, tissue: Tissue) -> list[Samples]:
+    """The lines to one side of a line, the nearest first: each is walked to from the one before."""
     from scipy.spatial import cKDTree  # only who draws such lines needs it
 
-    p, ground = tissue.relief.walk(base, aside, np.full(len(base), distance))
-    near = cKDTree(base).query(p)[0]
-    # the straight distance is less than that along the surface; the line's own crossings come much nearer
-    keep = np.flatnonzero(near >= 0.97 * np.linalg.norm(p - base, axis=1))
-    p = p[keep]
-    parts = _parts(piece[keep], np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))]), 10 * pace)
-    return on_surface(p, ground[keep], parts)
+    tree, p, d = cKDTree(base), base, aside
+    out = []
+    for _ in range(stroke.count):
+        p, d, ground = tissue.relief.walk_on(p, d, np.full(len(base), stroke.spacing_mm))
+        # the straight distance is less than that along the surface; the line's own crossings come much nearer
+        keep = np.flatnonzero(tree.query(p)[0] >= 0.97 * np.linalg.norm(p - base, axis=1))
+        q = p[keep]
+        gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
+        out.append(on_surface(q, ground[keep], _parts(piece[keep], gone, 10 * pace)))
+    return out
 
 
 def _parts(piece: Any, at: Any, most: float) -> Any:

@@ -86,17 +86,17 @@ def from_photograph(pixels: F64, camera: str, closed: bool, tissue: Tissue, s: G
     if footprint == 0.0:
         raise GuidanceError(f"camera '{camera}' has no points in this scan; draw in another view, or scan again")
     path = np.concatenate([pixels, pixels[:1]]) if closed else pixels
-    dense, _ = resampled(path, max(0.5, s.sample_mm / footprint), s.max_samples)
+    H, W = tissue.grids[number].reasons.shape
+    path, beside = clipped(path, np.array([-3.0, -3.0]), np.array([W + 2.0, H + 2.0]))
+    dense, _ = resampled(path, max(0.5, s.sample_mm / footprint), s.max_samples, beside, s.jump_mm / footprint)
     out = _seen(dense, camera, tissue, s)
     xyz, guessed = _bridged(out.xyz)
     piece, jumps = _pieces(xyz, guessed, dense, footprint, s)
-    H, W = tissue.grids[number].reasons.shape
     off = ~((dense >= -0.5).all(1) & (dense[:, 0] < W - 0.5) & (dense[:, 1] < H - 0.5))
     notes = []
     if off.any():
         notes.append(f"{off.mean():.0%} of it lies beside the picture of {camera} ({W} x {H})")
-    if (out.source == Source.OTHERS).any():
-        part = (out.source == Source.OTHERS).mean()
+    if (part := float((out.source == Source.OTHERS).mean())) >= 0.005:
         notes.append(f"{part:.0%} of it is carried by the surface of other views, over holes of {camera}")
     notes += [f"the surface jumps by {j:.1f} mm under it: it is broken there" for j in jumps[:3]]
     if len(jumps) > 3:
@@ -187,7 +187,7 @@ def from_world(points: F64, closed: bool, tissue: Tissue, s: GuideSettings) -> S
     space. Points that float above the surface by more than `off_surface_mm`, or lie where there is none, are holes.
     """
     path = np.concatenate([points, points[:1]]) if closed else points
-    xyz, leg = resampled(path, s.sample_mm, s.max_samples)
+    xyz, leg = resampled(path, s.sample_mm, s.max_samples, most_step=s.jump_mm)
     projector = tissue.rig.projector
     uv = geometry.project(projector, xyz)
     gap, slack = known_gap(xyz, uv, tissue)
@@ -278,14 +278,45 @@ def in_shadow(xyz: F64, uv: F64, source: Any, tissue: Tissue, s: GuideSettings) 
         return np.asarray(gap > limit)
 
 
-def resampled(path: F64, step: float, most: int) -> tuple[F64, Any]:
+def clipped(path: F64, low: F64, high: F64) -> tuple[F64, Bool]:
+    """A polyline (n, 2) with points where it crosses a box, and which of its legs (m - 1,) run outside the box."""
+    a, d = path[:-1], np.diff(path, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.sort(np.stack([(low - a) / d, (high - a) / d]), axis=0)
+    still = d == 0
+    inside = (a >= low) & (a <= high)
+    enter = np.where(still, np.where(inside, 0.0, np.inf), t[0]).max(1)
+    leave = np.where(still, np.where(inside, 1.0, -np.inf), t[1]).min(1)
+    crosses = np.minimum(leave, 1.0) > np.maximum(enter, 0.0)
+    cuts = np.stack([np.zeros(len(a)), np.where(crosses, enter, -1.0), np.where(crosses, leave, -1.0)], 1)
+    there = np.concatenate([np.ones((len(a), 1), bool), (cuts[:, 1:] > 0) & (cuts[:, 1:] < 1)], 1)
+    points = (a[:, None] + d[:, None] * cuts[..., None])[there]
+    out = np.concatenate([points, path[-1:]])
+    middle = 0.5 * (out[1:] + out[:-1])
+    return out, ~((middle >= low) & (middle <= high)).all(1)
+
+
+def resampled(
+    path: F64, step: float, most: int, sparse: Bool | None = None, most_step: float = np.inf
+) -> tuple[F64, Any]:
     """A polyline (n, d) with a point at least every `step` along it, its own points among them; at most about `most`.
 
     Returns the points (m, d) and which of them are its own (k,): of own points closer than a quarter of the step only
-    some are kept, the last always.
+    some are kept, the last always. Legs (n - 1,) that are `sparse` get none between. Raises GuidanceError where the
+    step would have to be larger than `most_step`.
     """
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    inner = lengths if sparse is None else np.where(sparse, 0.0, lengths)
+    asked, step = step, max(step, float(inner.sum()) / most)
+    if step > max(most_step, asked):
+        raise GuidanceError(f"is too long to be followed in {most} steps; split it, or give guide.max_samples")
+    if sparse is not None and sparse.any():
+        keep = np.concatenate([[True], ~(sparse[1:] & sparse[:-1]), [True]])  # of what runs outside, the ends
+        path = path[keep]
+        sparse = np.asarray(sparse[np.flatnonzero(keep)[:-1]])
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    step = max(step, gone[-1] / most)
+    if sparse is not None and sparse.any():
+        return _with_gaps(path, gone, step, sparse)
     keep = np.concatenate([[True], np.diff(np.floor(gone / (0.25 * step))) > 0])
     keep[-1] = True
     path, gone = path[keep], gone[keep]
@@ -296,7 +327,18 @@ def resampled(path: F64, step: float, most: int) -> tuple[F64, Any]:
     first = np.concatenate([[0], np.cumsum(count)])
     if len(path) == 1:
         return path, np.array([0])
+    return _between(path, count), first
+
+
+def _with_gaps(path: F64, gone: F64, step: float, sparse: Bool) -> tuple[F64, Any]:
+    """As `resampled`, all own points kept, and none put between those of sparse legs."""
+    count = np.where(sparse, 1, np.maximum(1, np.ceil(np.diff(gone) / step - 1e-9))).astype(np.intp)
+    return _between(path, count), np.concatenate([[0], np.cumsum(count)])
+
+
+def _between(path: F64, count: Any) -> F64:
+    """A polyline (n, d) with each leg in `count` (n - 1,) parts."""
     leg = np.repeat(np.arange(len(count)), count)
-    share = (np.arange(first[-1]) - first[leg]) / count[leg]
+    share = (np.arange(len(leg)) - np.concatenate([[0], np.cumsum(count)])[leg]) / count[leg]
     out = path[leg] + (path[leg + 1] - path[leg]) * share[:, None]
-    return np.concatenate([out, path[-1:]]), first
+    return np.concatenate([out, path[-1:]])

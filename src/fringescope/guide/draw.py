@@ -13,6 +13,8 @@ from fringescope.kernels import guiding as k
 from fringescope.settings import GuideSettings
 from fringescope.types import F32, F64, U8, Guided, Layout, Projector, Trace
 
+STRIPE = 16  #: rows of the device in a stripe of what is filled and in doubt
+
 
 def linear(color: tuple[int, int, int]) -> F64:
     """An sRGB colour, 0..255, as levels (3,) of lamps that are linear in light, 0..1 (IEC 61966-2-1)."""
@@ -32,7 +34,11 @@ class Canvas:
         """Paints what of a stroke is visible."""
         color = linear(g.stroke.color).astype(np.float32) * np.float32(s.brightness)
         for patch in patches:
-            self._paint(patch.share, patch.top, patch.left, color)
+            share = patch.share
+            if dashed:  # in stripes
+                rows = (patch.top + np.arange(len(share))) // STRIPE % 2 == 0
+                share = np.ascontiguousarray(share * rows[:, None], np.float32)
+            self._paint(share, patch.top, patch.left, color)
         parts = [ribbons_of(t, a, b, s.dash_mm if dashed else None) for t in g.traces for a, b in visible_runs(t)]
         if not parts:
             return

@@ -19,6 +19,7 @@ from fringescope.guide.tissue import Tissue
 from fringescope.settings import GuideSettings
 from fringescope.types import F32, F64, Bool, Layout, Projector, Stroke
 
+FONT = "DejaVu Sans"  #: comes with matplotlib: the same letters everywhere
 FINE = 4  #: samples along each side of a unit
 BITS = 4  #: fractions of a pixel in OpenCV's coordinates
 
@@ -137,15 +138,27 @@ def area(share: F32, low: Any, relief: Relief, outline: F64, sigma_mm: float) ->
 # --------------------------------------------------------------------------------------------------------------- text
 
 
-def letters(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> tuple[list[F64], Bool]:
-    """The outlines of a text on the projector's plane, each (n, 2), and which of their points are on the surface.
+def _without_a_letter(text: str) -> str:
+    """What of a text the font cannot draw."""
+    from matplotlib.font_manager import FontProperties, findfont, get_font
+
+    font = get_font(findfont(FontProperties(family=FONT)))
+    return "".join(dict.fromkeys(c for c in text if not c.isspace() and font.get_char_index(ord(c)) == 0))
+
+
+def letters(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> tuple[list[F64], list[F64], Bool]:
+    """The outlines of a text: on the tissue, each (n, 3) mm, on the projector's plane, each (n, 2), and which of their
+    points are on the surface.
 
     It starts at the first point and runs towards the second, or to the projector's right; `size_mm` is the height of
     its lines. Each letter lies on the surface: along the line of writing first, then up.
     """
+    from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath  # only who writes needs it
 
-    path = TextPath((0, 0), stroke.text.replace("$", r"\$"), size=stroke.size_mm)
+    if missing := _without_a_letter(stroke.text):
+        raise GuidanceError(f"text {stroke.text!a}: the font has no letter for {missing!a}; write it otherwise")
+    path = TextPath((0, 0), stroke.text.replace("$", r"\$"), stroke.size_mm, FontProperties(family=FONT))
     rings = [r for r in map(np.asarray, path.to_polygons(closed_only=False)) if len(r) > 2]
     if not rings:
         raise GuidanceError(f"text {stroke.text!r} has nothing to draw")
@@ -164,4 +177,4 @@ def letters(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> tuple[list[F64]
     p, above = tissue.relief.walk(foot, np.sign(xy[:, 1:] + 1e-12) * up, np.abs(xy[:, 1]))
     uv = geometry.project(tissue.rig.projector, p)
     cuts = np.cumsum([len(r) for r in rings])[:-1]
-    return np.split(uv, cuts), ground & above
+    return np.split(p, cuts), np.split(uv, cuts), ground & above

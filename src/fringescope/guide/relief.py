@@ -80,6 +80,11 @@ class Relief:
         From `start` (n, 3), towards `direction` (n, 3), so many mm (n,). Returns the places (n, 3), and whether the
         ground was measured there: over holes and from edges they go on straight ahead through the air.
         """
+        p, _, ground = self.walk_on(start, direction, distance)
+        return p, ground
+
+    def walk_on(self, start: F64, direction: F64, distance: F64) -> tuple[F64, F64, Bool]:
+        """As `walk`, with the directions (n, 3) in which the walkers look in the end."""
         p, d = start.astype(np.float64).copy(), _unit(direction)
         left = distance.astype(np.float64).copy()
         ground = np.ones(len(p), bool)
@@ -90,7 +95,7 @@ class Relief:
             step = np.minimum(left[go], STEP_MM)
             p[go], d[go], ground[go] = self._step(p[go], d[go], step)
             left[go] -= step
-        return p, ground
+        return p, d, ground
 
     def _step(self, p: F64, d: F64, step: F64) -> tuple[F64, F64, Bool]:
         ahead = p + d * step[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +39,7 @@ def carry_over(
     strokes: list[Stroke] = []
     refused = dict(guidelines.refused)
     errors: dict[str, float] = {}
+    taken = {x.id for x in guidelines.strokes} | set(refused)
     for stroke in guidelines.strokes:
         try:
             parts = _pieces(stroke, old, s)
@@ -46,11 +48,21 @@ def carry_over(
             continue
         for i, part in enumerate(parts):
             there, error = register.carried(part, found)
-            name = stroke.id if i == 0 else f"{stroke.id} ({i + 1})"
+            name = stroke.id if i == 0 else _unused(stroke.id, taken)
+            taken.add(name)
             closed = stroke.closed and len(parts) == 1
-            strokes.append(replace(stroke, id=name, camera=None, pixels=None, world_mm=there, closed=closed))
+            headless = stroke.kind is StrokeKind.ARROW and i < len(parts) - 1
+            kind = StrokeKind.LINE if headless else stroke.kind
+            strokes.append(
+                replace(stroke, id=name, kind=kind, camera=None, pixels=None, world_mm=there, closed=closed)
+            )
             errors[name] = float(np.median(error))
     return Carried(Guidelines(tuple(strokes), refused=refused), found, errors)
+
+
+def _unused(name: str, taken: set[str]) -> str:
+    """`name (2)`, or the next number that no stroke has."""
+    return next(n for k in itertools.count(2) if (n := f"{name} ({k})") not in taken)
 
 
 def _pieces(stroke: Stroke, tissue: guide.Tissue, s: Settings) -> list[F64]:

@@ -35,7 +35,7 @@ COLOURS = {
 def read_guidelines(path: Path | str) -> Guidelines:
     """The strokes of a guidelines file. What a single stroke has wrong is told in `refused`; the others are read.
 
-    Raises FormatError for a file that is none, or of a higher version, and for strokes that share an id.
+    Of two with one id the first counts. Raises FormatError for a file that is none, or of a higher version.
     """
     path = Path(path)
     return parse_guidelines(files.read_json(path, "guidelines (a file with strokes)"), path)
@@ -55,12 +55,12 @@ def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
     seen: set[str] = set()
     for i, entry in enumerate(listed):
         name = entry.get("id") if isinstance(entry, Mapping) else None
-        if not (isinstance(name, str) and name.strip()) or len(name) > 200:
-            name = f"strokes[{i}]"
-            refused[name] = "has no id (a word); needed one"
+        if not (isinstance(name, str) and name.strip() and name.isprintable()) or len(name) > 200:
+            refused[f"strokes[{i}]"] = "has no id (a word of printable letters); needed one"
             continue
         if name in seen:
-            raise FormatError(f"{path}: two strokes have the id {files.shown(name)}; needed one id per stroke")
+            refused[f"strokes[{i}]"] = f"has the id {files.shown(name)} of a stroke before it; needed one of its own"
+            continue
         seen.add(name)
         try:
             strokes.append(_stroke(name, entry))

@@ -51,6 +51,9 @@ class Hidden(Enum):
 
 
 WIDTH_MM = 0.5  #: of a stroke that asks for no width
+FARTHEST = 1e6  #: pixels or mm; no picture and no tissue reaches so far
+LETTERS = 100  #: of a text at most
+ASIDE_MM = 200.0  #: parallel lines lie no farther from their stroke
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +110,17 @@ class Stroke:
         least = needed.get(self.kind, 2)
         if n < least:
             raise GuidanceError(f"has {n} point{'' if n == 1 else 's'}; a {self.kind.value} needs at least {least}")
-        if self.kind is StrokeKind.TEXT and not self.text.strip():
-            raise GuidanceError("is a text without words")
+        if self.kind is StrokeKind.TEXT:
+            if not self.text.strip():
+                raise GuidanceError("is a text without words")
+            if len(self.text) > LETTERS or not self.text.isprintable():
+                came = f"text {self.text[:20]!a} of {len(self.text)}"
+                raise GuidanceError(f"{came}; needed 1 to {LETTERS} printable letters")
+        elif self.kind is not StrokeKind.CIRCLE and not np.ptp(self.points, axis=0).any():
+            raise GuidanceError("all its points are the same; needed a line of some length")
+        if self.kind is StrokeKind.OFFSETS and self.count * self.spacing_mm > ASIDE_MM:
+            far = self.count * self.spacing_mm
+            raise GuidanceError(f"its parallels reach {far:g} mm to the side; needed at most {ASIDE_MM:g} mm")
 
     @property
     def points(self) -> F64:
@@ -120,14 +132,19 @@ class Stroke:
 
 def _points(a: Any, name: str, n: int) -> F64:
     try:
-        points = np.array(a, dtype=np.float64)
+        raw = np.array(a)
     except (TypeError, ValueError, OverflowError):
-        raise GuidanceError(f"{name}: not numbers; needed a list of {n} numbers per point") from None
+        raw = np.array(None)
+    if raw.size and raw.dtype.kind not in "iuf":
+        raise GuidanceError(f"{name}: not numbers; needed a list of {n} numbers per point")
+    points = raw.astype(np.float64)
     if points.ndim != 2 or points.shape[1] != n or not len(points):
         raise GuidanceError(f"{name}: of shape {points.shape}; needed at least one point of {n} numbers")
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise GuidanceError(f"{name}: {bad} of {len(points)} points are NaN or infinite; needed finite numbers")
+    if float(np.abs(points).max()) > FARTHEST:
+        raise GuidanceError(f"{name}: reaches to {np.abs(points).max():.3g}; needed points within {FARTHEST:,.0f}")
     points.setflags(write=False)
     return points
 
