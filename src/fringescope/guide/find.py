@@ -20,6 +20,7 @@ from fringescope.guide.tissue import Tissue
 from fringescope.guide.trace import visible_runs
 from fringescope.settings import LoopSettings
 from fringescope.types import F32, F64, AnyArray, Bool, Camera, Fill, Guidance, Guided, Landing, PixelFormat
+from fringescope.types.guidance import WIDTH_MM
 
 REACHES = 61  #: places across a line at which its centre is tried, before it is refined
 
@@ -80,8 +81,6 @@ def _points(g: Guided) -> F64:
 def _half_mm(g: Guided, half: F64) -> F64:
     width = g.stroke.width_mm
     if width is None and g.stroke.width_px is None:
-        from fringescope.types.guidance import WIDTH_MM
-
         width = WIDTH_MM
     return np.full(len(half), 0.5 * width) if width is not None else np.full(len(half), np.nan)
 

@@ -11,7 +11,7 @@ from fringescope import capture, fuse, guide, report
 from fringescope.devices.base import Camera, Station
 from fringescope.errors import DeviceError
 from fringescope.settings import Settings
-from fringescope.types import U8, Guidance, Landing, PixelFormat, Rig
+from fringescope.types import U8, Guidance, Landing, Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,3 @@ def landing_pictures(closed: Closed, rig: Rig, s: Settings) -> dict[str, U8]:
         index = rig.index(shot.camera)
         out[shot.camera] = report.landing_picture(0.4 * white + guided, rig.cameras[index], index, closed.landings)
     return out
-
-
-def formats_of(station: Station) -> list[PixelFormat]:
-    """What each camera of a station records now."""
-    return [c.settings.pixel_format for c in station.cameras]
