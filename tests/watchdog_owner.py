@@ -44,11 +44,13 @@ class Diary(Guard):
 
 
 def hold_the_interpreter(seconds: float) -> None:
-    """One call that lets no other thread run."""
-    end = time.monotonic() + seconds
-    n = 1_000_000
-    while time.monotonic() < end:
+    """One call, of at least so long, that lets no other thread run."""
+    n, took = 1_000_000, 0.0
+    while took < seconds:
+        begin = time.monotonic()
         sum(range(n))
+        took = time.monotonic() - begin
+        n = int(1.5 * n * min(100.0, seconds / took)) if took < seconds else n
 
 
 def main() -> None:
