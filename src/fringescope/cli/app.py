@@ -81,6 +81,14 @@ VERBS: dict[str, tuple[str, str]] = {
         "The simulated instrument scans a wet specimen: capture, scan, error map against the truth, "
         "rendered pictures.",
     ),
+    "serve": (
+        "serving",
+        "The hub: cases, shared drawing, and the instrument, for the operator here and experts anywhere.",
+    ),
+    "person": (
+        "serving",
+        "Accounts of a hub that does not run just now; a password is asked for, or read from a pipe.",
+    ),
     "bench": (
         "timing",
         "Times a scan against a plain copy of the same memory and against other decoders, all in one run.",

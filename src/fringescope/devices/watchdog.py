@@ -127,7 +127,7 @@ class Guard:
         except OSError as e:
             raise DeviceLostError(f"{p.info.uri}: no watchdog, and nothing is shown without one: {e}") from e
         try:
-            order = {"switch": _described(self._switch), "beat_ms": self._s.beat_ms, "deadline_ms": self._s.deadline_ms}
+            order = {"switch": described(self._switch), "beat_ms": self._s.beat_ms, "deadline_ms": self._s.deadline_ms}
             self._send(json.dumps(order).encode() + b"\n")
         except OSError:
             pass  # it has ended already, and says why
@@ -282,10 +282,22 @@ def _launch() -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, env=env, bufsize=0, **how)
 
 
-def _described(switch: KillSwitch) -> dict[str, Any]:
+def described(switch: KillSwitch) -> dict[str, Any]:
+    """A kill switch as plain values, for another process: `rebuilt` makes it there."""
     kind = type(switch)
     values = {f.name: getattr(switch, f.name) for f in dataclasses.fields(switch) if f.init}
     return {"module": kind.__module__, "name": kind.__qualname__, "values": values}
+
+
+def rebuilt(plain: dict[str, Any]) -> KillSwitch:
+    """The kill switch that `described` was given in another process of ours. Only for what comes from there."""
+    kind: Any = importlib.import_module(plain["module"])
+    for part in plain["name"].split("."):
+        kind = getattr(kind, part)
+    if not (isinstance(kind, type) and issubclass(kind, KillSwitch)):
+        raise UsageError(f"{plain['name']} is no kill switch")
+    switch: KillSwitch = kind(**plain["values"])
+    return switch
 
 
 # -------------------------------------------------------------------------------------------------------- the process
@@ -399,10 +411,7 @@ def main() -> int:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     order = _order(0)
-    kind: Any = importlib.import_module(order["switch"]["module"])
-    for part in order["switch"]["name"].split("."):
-        kind = getattr(kind, part)
-    switch: KillSwitch = kind(**order["switch"]["values"])
+    switch = rebuilt(order["switch"])
     switch.open()
     _ahead_of_others()
     gc.freeze()

@@ -15,6 +15,7 @@ from fringescope.store.capture import (
 from fringescope.store.comparison import check_pair, put_comparison, read_strokes
 from fringescope.store.files import new_file, new_folder, write_json
 from fringescope.store.guidelines import (
+    check_stroke,
     guidelines_document,
     parse_guidelines,
     pattern_document,
@@ -55,6 +56,7 @@ __all__ = [
     "calibration_document",
     "check_pair",
     "check_rig",
+    "check_stroke",
     "guidelines_document",
     "hash_capture",
     "hash_rig",

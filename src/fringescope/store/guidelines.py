@@ -6,7 +6,7 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from fringescope.types import Fill, Guidance, Guided, Guidelines, Landing, Side,
 
 FORMAT, VERSION = "fringescope-guidelines", 1
 PATTERN_FORMAT, PATTERN_VERSION = "fringescope-pattern", 1
+
+NO_ID = "has no id (a word of printable letters); needed one"
 
 #: names of colours that a file may use beside #rrggbb
 COLOURS = {
@@ -55,8 +57,8 @@ def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
     seen: set[str] = set()
     for i, entry in enumerate(listed):
         name = entry.get("id") if isinstance(entry, Mapping) else None
-        if not (isinstance(name, str) and name.strip() and name.isprintable()) or len(name) > 200:
-            refused[f"strokes[{i}]"] = "has no id (a word of printable letters); needed one"
+        if not is_id(name):
+            refused[f"strokes[{i}]"] = NO_ID
             continue
         if name in seen:
             refused[f"strokes[{i}]"] = f"has the id {files.shown(name)} of a stroke before it; needed one of its own"
@@ -67,6 +69,19 @@ def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
         except GuidanceError as e:
             refused[name] = str(e)
     return Guidelines(tuple(strokes), doc.get("scan"), doc.get("rig"), refused)
+
+
+def check_stroke(entry: Mapping[str, Any]) -> Stroke:
+    """One stroke of a guidelines file. Raises GuidanceError, which says what is wrong with it."""
+    name = entry.get("id")
+    if not is_id(name):
+        raise GuidanceError(NO_ID)
+    return _stroke(name, entry)
+
+
+def is_id(name: object) -> TypeGuard[str]:
+    """Whether it can be the id of a stroke."""
+    return isinstance(name, str) and bool(name.strip()) and name.isprintable() and len(name) <= 200
 
 
 def guidelines_document(guidelines: Guidelines, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -92,7 +92,8 @@ def _votes(t: Tested, s: WatchSettings) -> _Votes:
     scale = float(np.clip(np.median(of("chi2")[fine]), 1.0, MOST_NOISE)) if fine.sum() > 20 else 1.0
     total = scale * cov + s.floor_px**2 * np.eye(2)
     values, axes = np.linalg.eigh(total)
-    known = (np.sqrt(np.maximum(values, 0)) * mm[:, None] < s.tile_sigma_mm + s.floor_px * mm[:, None]) & (texture[:, :1] > 2)
+    fine_enough = np.sqrt(np.maximum(values, 0)) * mm[:, None] < s.tile_sigma_mm + s.floor_px * mm[:, None]
+    known = fine_enough & (texture[:, :1] > 2)
     known[:, 0] = True
     along = np.einsum("nij,ni->nj", axes, shift) * known
     kept = np.einsum("nij,nj->ni", axes, along)

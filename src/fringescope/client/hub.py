@@ -1,0 +1,229 @@
+"""The API of a hub, as methods."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import httpx
+
+from fringescope.errors import FringescopeError
+from fringescope.wire import Account, Case, CaseList, Invitation, Job, JobState, Person, ScanInfo
+from fringescope.wire.documents import CaseState, InstrumentState
+from fringescope.wire.room import Event, Said
+
+if TYPE_CHECKING:
+    from fringescope.client.room import Room
+
+
+class HubError(FringescopeError):
+    """A hub said no, or does not answer; `status` is that of HTTP, 0 without an answer."""
+
+    def __init__(self, message: str, status: int = 0) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Client:
+    """Somebody who is signed in at a hub. Raises HubError, with the hub's own sentence.
+
+    `verify`: False or a file with a certificate, for a hub that made its own. `http`: another transport, for tests.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        name: str | None = None,
+        password: str | None = None,
+        *,
+        verify: bool | str = True,
+        timeout_s: float = 30.0,
+        http: httpx.Client | None = None,
+    ) -> None:
+        self.url, self.verify = url.rstrip("/"), verify
+        self.http = http or httpx.Client(base_url=self.url, verify=verify, timeout=timeout_s)
+        self.account: Account | None = None
+        if name is not None:
+            self.sign_in(name, password or "")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the connection; the session goes on until it is signed out or has expired."""
+        self.http.close()
+
+    # --------------------------------------------------------------------------------------------------------- asking
+
+    def ask(self, method: str, path: str, body: Any = None, **query: Any) -> Any:
+        """One request, its answer as plain values."""
+        answer = self.raw(method, path, body, **query)
+        return answer.json() if answer.content else None
+
+    def raw(
+        self, method: str, path: str, body: Any = None, content: bytes | None = None, **query: Any
+    ) -> httpx.Response:
+        """One request, its answer as it came."""
+        headers = {"X-CSRF-Token": self.account.csrf} if self.account and method != "GET" else {}
+        params = {k: v for k, v in query.items() if v is not None}
+        try:
+            answer = self.http.request(method, path, json=body, content=content, params=params, headers=headers)
+        except httpx.HTTPError as e:
+            raise HubError(f"{self.url}: {e or type(e).__name__}; is the hub there?") from e
+        if answer.status_code >= 400:
+            try:
+                why = str(answer.json()["detail"])
+            except (ValueError, KeyError, TypeError):
+                why = f"{method} {path}: status {answer.status_code}"
+            raise HubError(why, answer.status_code)
+        return answer
+
+    # ---------------------------------------------------------------------------------------------------------- people
+
+    def sign_in(self, name: str, password: str) -> Account:
+        """Signs in."""
+        self.account = Account(**self.ask("POST", "/api/login", {"name": name, "password": password}))
+        return self.account
+
+    def accept(self, token: str, code: str) -> Account:
+        """Comes in as a guest, by an invitation."""
+        self.account = Account(**self.ask("POST", "/api/invitations/accept", {"token": token, "code": code}))
+        return self.account
+
+    def sign_out(self) -> None:
+        """Signs out."""
+        self.ask("POST", "/api/logout")
+        self.account = None
+
+    def confirm(self, password: str) -> None:
+        """The password once more, before a signature."""
+        self.ask("POST", "/api/confirm", {"password": password})
+
+    @property
+    def me(self) -> Account:
+        """Who is signed in."""
+        if self.account is None:
+            raise HubError("nobody is signed in; sign in first", 401)
+        return self.account
+
+    def people(self) -> list[Person]:
+        """Everybody with an account."""
+        return [Person(**p) for p in self.ask("GET", "/api/people")]
+
+    def add_person(self, name: str, password: str, role: str) -> Person:
+        """A new account."""
+        return Person(**self.ask("POST", "/api/people", {"name": name, "password": password, "role": role}))
+
+    # ----------------------------------------------------------------------------------------------------------- cases
+
+    def cases(self, q: str = "", status: str | None = None, limit: int = 50, offset: int = 0) -> CaseList:
+        """Cases that you may see, the latest first."""
+        return CaseList(**self.ask("GET", "/api/cases", q=q, status=status, limit=limit, offset=offset))
+
+    def open_case(
+        self,
+        accession: str,
+        specimen: Mapping[str, str] | None = None,
+        patient: Mapping[str, str] | None = None,
+    ) -> HubCase:
+        """A new case."""
+        body = {"accession": accession, "specimen": dict(specimen or {}), "patient": dict(patient) if patient else None}
+        return HubCase(self, Case(**self.ask("POST", "/api/cases", body)).id)
+
+    def case(self, case: str) -> HubCase:
+        """A case by its identifier."""
+        return HubCase(self, Case(**self.ask("GET", f"/api/cases/{case}")).id)
+
+    # -------------------------------------------------------------------------------------------------- the instrument
+
+    def instrument(self) -> InstrumentState:
+        """The instrument: is it there, what does it do."""
+        return InstrumentState(**self.ask("GET", "/api/instrument"))
+
+    def stop(self) -> None:
+        """Dark, whatever is projected."""
+        self.ask("POST", "/api/instrument/stop")
+
+    def befall(self, **what: str) -> None:
+        """For the simulated instrument: something happens to the specimen, as move="0.3,0,0"."""
+        self.ask("POST", "/api/instrument/simulate", what)
+
+    def wait(self, job: Job, tell: Callable[[Job], None] | None = None, timeout_s: float = 600.0) -> Job:
+        """Until a job has ended. Raises HubError if it failed."""
+        end = time.monotonic() + timeout_s
+        while True:
+            job = Job(**self.ask("GET", f"/api/jobs/{job.id}"))
+            if tell is not None:
+                tell(job)
+            if job.state in (JobState.DONE, JobState.CANCELLED, JobState.FAILED):
+                break
+            if time.monotonic() > end:
+                raise HubError(f"job {job.id} has not ended in {timeout_s:g} s; it is {job.stage}")
+            time.sleep(0.05)
+        if job.state is not JobState.DONE:
+            raise HubError(f"{job.kind}: {job.why}")
+        return job
+
+
+class HubCase:
+    """One case of a hub."""
+
+    def __init__(self, hub: Client, case: str) -> None:
+        self.hub, self.id = hub, case
+        self._path = f"/api/cases/{case}"
+
+    def get(self) -> Case:
+        """What it is."""
+        return Case(**self.hub.ask("GET", self._path))
+
+    def change(self, **what: Any) -> Case:
+        """Changes status, specimen or patient."""
+        return Case(**self.hub.ask("PATCH", self._path, what))
+
+    def state(self) -> CaseState:
+        """Where it stands."""
+        return CaseState(**self.hub.ask("GET", f"{self._path}/state"))
+
+    def events(self, since: int = 0, limit: int = 2000) -> list[Event]:
+        """The log behind number `since`."""
+        return [Event(**e) for e in self.hub.ask("GET", f"{self._path}/events", since=since, limit=limit)]
+
+    def say(self, ops: Sequence[Mapping[str, Any]]) -> list[Said]:
+        """Ops, each with client, number and what, as after a time offline."""
+        return [Said(**x) for x in self.hub.ask("POST", f"{self._path}/ops", [dict(o) for o in ops])]
+
+    def scan(self, label: str = "", wait: bool = True, tell: Callable[[Job], None] | None = None) -> Job:
+        """Takes a scan."""
+        job = Job(**self.hub.ask("POST", f"{self._path}/scans", {"label": label}))
+        return self.hub.wait(job, tell) if wait else job
+
+    def scans(self) -> list[ScanInfo]:
+        """Its scans, with their files."""
+        return [ScanInfo(**s) for s in self.hub.ask("GET", f"{self._path}/scans")]
+
+    def fetch(self, sha256: str, to: Path | None = None) -> bytes:
+        """A file by its content, kept in a file if you like."""
+        data = self.hub.raw("GET", f"{self._path}/files/{sha256}").content
+        if to is not None:
+            to.write_bytes(data)
+        return data
+
+    def invite(self, name: str, role: str = "expert", hours: float = 72) -> Invitation:
+        """Invites somebody; the answer alone holds token and code."""
+        body = {"name": name, "role": role, "hours": hours}
+        return Invitation(**self.hub.ask("POST", f"{self._path}/invitations", body))
+
+    def revoke(self, invitation: str) -> Invitation:
+        """Takes an invitation back: the guest is out."""
+        return Invitation(**self.hub.ask("DELETE", f"{self._path}/invitations/{invitation}"))
+
+    def enter(self, since: int = 0) -> Room:
+        """Enters its room."""
+        from fringescope.client.room import Room
+
+        return Room(self, since)

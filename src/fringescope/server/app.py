@@ -1,0 +1,78 @@
+"""The web application: the parts, the routes, and what every answer has in common."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import argon2
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException as RawHTTPException
+
+from fringescope import __version__
+from fringescope.errors import FringescopeError, OutputError
+from fringescope.server.config import Config
+from fringescope.server.routes import audit, cases, people, room, scans, signing
+from fringescope.server.security import Guarded
+from fringescope.server.site import open_site
+
+
+def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> FastAPI:
+    """A hub as an ASGI application; its parts live in `app.state.site`. Raises OutputError and FormatError."""
+    site = open_site(config, hasher)
+
+    @asynccontextmanager
+    async def life(_app: FastAPI) -> AsyncIterator[None]:
+        await site.hub.start()
+        await site.instrument.start()
+        try:
+            yield
+        finally:
+            site.rooms.end()
+            await site.jobs.stop()
+            await site.hub.stop()
+            await site.instrument.stop()
+            site.close()
+
+    app = FastAPI(
+        title="Fringescope hub",
+        version=__version__,
+        summary="One shared truth about each case: scans, strokes, and what is projected.",
+        lifespan=life,
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/openapi.json",
+    )
+    app.state.site = site
+    for part in (signing, people, cases, scans, audit, room):
+        app.include_router(part.router)
+    _explain(app)
+    app.add_middleware(Guarded, config=config, requests=site.requests)
+    return app
+
+
+def _explain(app: FastAPI) -> None:
+    """Whatever goes wrong is told in one sentence, in one form."""
+
+    @app.exception_handler(RawHTTPException)
+    async def raw(_request: Request, e: RawHTTPException) -> JSONResponse:
+        headers = dict(e.headers) if e.headers else None
+        return JSONResponse({"detail": str(e.detail)}, e.status_code, headers)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(_request: Request, e: RequestValidationError) -> JSONResponse:
+        said = []
+        for one in e.errors()[:5]:
+            where = ".".join(str(x) for x in one["loc"][1:]) or str(one["loc"][0])
+            said.append(f"{where}: {one['msg']}")
+        return JSONResponse({"detail": "; ".join(said)[:1000]}, 422)
+
+    @app.exception_handler(OutputError)
+    async def unwritten(_request: Request, e: OutputError) -> JSONResponse:
+        return JSONResponse({"detail": str(e)}, 507)
+
+    @app.exception_handler(FringescopeError)
+    async def failed(_request: Request, e: FringescopeError) -> JSONResponse:
+        return JSONResponse({"detail": str(e)}, 409)

@@ -1,0 +1,81 @@
+"""How a hub is set up: where its data lies, where it listens, and its limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fringescope.errors import UsageError
+from fringescope.settings import Settings
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one person, one message and one room may ask for."""
+
+    message_bytes: int = 1_000_000  #: longest message through a room
+    body_bytes: int = 4_000_000  #: longest body of a request
+    upload_bytes: int = 2_000_000_000  #: longest bundle
+    ops_per_s: float = 40.0  #: ops of one connection, on average
+    ops_burst: int = 400  #: and at once, as after a time offline
+    live_per_s: float = 120.0  #: pointers, views and ink of one connection
+    requests_per_s: float = 100.0  #: requests of one address
+    requests_burst: int = 500
+    logins_per_minute: float = 20.0  #: of one address
+    failures: int = 8  #: wrong passwords in a row that lock an account
+    locked_s: float = 300.0  #: for so long
+    session_s: float = 12 * 3600.0  #: a session ends after
+    idle_s: float = 3600.0  #: or after so long without a request
+    waiting: int = 4000  #: messages that wait for a browser that does not read before it is let go
+    present: int = 400  #: connections to one room
+    videos: int = 40  #: streams of video
+
+
+@dataclass(frozen=True)
+class Config:
+    """A hub. `instrument` is the URI of the devices, None for a hub without; `rig` the rig.json they are used with.
+
+    Raises UsageError for an address that others reach without TLS.
+    """
+
+    data: Path
+    host: str = "127.0.0.1"
+    port: int = 8017
+    database: str | None = None  #: URL; None = SQLite in `data`
+    instrument: str | None = None
+    rig: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    origins: tuple[str, ...] = ()  #: further origins of pages that may talk to it, as https://hub.hospital.example
+    behind_proxy: bool = False  #: another server hands requests on: nobody is local by their address alone
+    settings: Settings = field(default_factory=Settings)
+    limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        if (self.certificate is None) != (self.key is None):
+            raise UsageError("--certificate and --key belong together; give both, or --self-signed")
+        if self.host not in LOOPBACK and self.certificate is None:
+            raise UsageError(
+                f"--host {self.host}: others could listen in; needed a certificate and its key (--certificate, --key), "
+                "or --self-signed to try it"
+            )
+
+    @property
+    def tls(self) -> bool:
+        """Whether it speaks https."""
+        return self.certificate is not None
+
+    @property
+    def url(self) -> str:
+        """SQLAlchemy's URL of the database."""
+        return self.database or f"sqlite:///{(self.data / 'hub.sqlite').resolve()}"
+
+    @property
+    def own_origins(self) -> tuple[str, ...]:
+        """Origins of its own pages."""
+        scheme = "https" if self.tls else "http"
+        names = {self.host, *(LOOPBACK if self.host in LOOPBACK else ())} - {"0.0.0.0", "::"}
+        hosts = [f"[{n}]" if ":" in n else n for n in sorted(names)]
+        return (*(f"{scheme}://{n}:{self.port}" for n in hosts), *self.origins)

@@ -1,0 +1,302 @@
+"""The one place where words get their order: rights, log, truth, and everybody in the room hears of it.
+
+Words of all cases wait in one queue; one task takes what waits, folds it into the truth, writes it in one transaction,
+and only then answers and tells the rooms. What cannot be written did not happen. A stop does not wait for the disk:
+the projector is dark before it is written down.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import sqlalchemy as sa
+
+from fringescope import examination
+from fringescope.errors import FringescopeError, OutputError
+from fringescope.server import database as db
+from fringescope.server import journal, truth
+from fringescope.server.accounts import Accounts
+from fringescope.server.clock import Clock
+from fringescope.server.rights import Speaker, refusal
+from fringescope.server.rooms import Rooms
+from fringescope.settings import ExaminationSettings
+from fringescope.types.examination import Dark, GuardLost, Phase, Warn, What
+from fringescope.wire.ops import Op
+from fringescope.wire.record import GENESIS, Record, link
+from fringescope.wire.room import Event, Said, Standing, Warned
+
+INSTRUMENT = "instrument"
+_BATCH = 256  #: words written at once
+_BOOKS = 64  #: cases whose truth is kept ready
+
+CarryOut = Callable[[Record, truth.Fold], Awaitable[None]]
+
+
+@dataclass(eq=False)
+class Book:
+    """A case that is open: its truth, the end of its chain, and what was said in it already."""
+
+    truth: truth.Truth
+    seq: int
+    head: str
+    said: dict[tuple[str, str], dict[int, tuple[int, str]]]  #: (person, client) -> number -> (event, refused)
+
+
+@dataclass(eq=False)
+class _Waiting:
+    """A word that waits for its place."""
+
+    case: str
+    actor: str
+    role: str
+    kind: str
+    payload: dict[str, Any]
+    client: str
+    number: int
+    said_ns: int
+    refused: str
+    answer: asyncio.Future[Said]
+    beside: Callable[[sa.Connection], None] | None = None  #: written in the same transaction
+
+
+@dataclass(eq=False)
+class _Batch:
+    before: dict[str, Book] = field(default_factory=dict)
+    records: list[Record] = field(default_factory=list)
+    beside: list[Callable[[sa.Connection], None]] = field(default_factory=list)
+    folds: list[tuple[_Waiting, Record, truth.Fold]] = field(default_factory=list)
+    answers: list[tuple[_Waiting, Said]] = field(default_factory=list)
+
+
+class Hub:
+    """The shared truth of all cases. Lives on one event loop; `start` and `stop` frame its life."""
+
+    def __init__(
+        self, engine: sa.Engine, clock: Clock, accounts: Accounts, rooms: Rooms,
+        settings: ExaminationSettings | None = None,
+    ):  # fmt: skip
+        self.engine, self.clock, self.accounts, self.rooms = engine, clock, accounts, rooms
+        self._settings = settings or ExaminationSettings()
+        self._queue: asyncio.Queue[_Waiting] = asyncio.Queue()
+        self._books: dict[str, Book] = {}
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="log")
+        self._task: asyncio.Task[None] | None = None
+        self._ticks: asyncio.Task[None] | None = None
+        self._numbers = 0
+        self._run = secrets.token_hex(8)  #: this run of the hub, the client of its own words
+        self.carry_out: CarryOut = _nobody
+        self.dark: Callable[[str], None] = lambda _why: None  #: darkness at once, from any thread
+
+    async def start(self) -> None:
+        """Begins to take words. What was lit when the hub last ended is stopped: nobody watched over it."""
+        self._task = asyncio.create_task(self._write(), name="hub")
+        self._ticks = asyncio.create_task(self._tick(), name="hub clock")
+        for case in await self._in_thread(lambda: list(journal.heads(self.engine))):
+            book = await self._book(case)
+            lit = [v for v in book.truth.exam.versions if v.phase in (Phase.ARMED, Phase.PROJECTING)]
+            if lit or book.truth.exam.guarded:
+                await self.tell(case, GuardLost("the hub was started anew"))
+
+    async def stop(self) -> None:
+        """Takes no more words; what waits is still written."""
+        if self._ticks is not None:
+            self._ticks.cancel()
+        if self._task is not None:
+            await self._queue.join()
+            self._task.cancel()
+        self._writer.shutdown()
+
+    # ------------------------------------------------------------------------------------------------------- saying
+
+    async def say(self, case: str, speaker: Speaker, op: Op, extra: dict[str, Any] | None = None) -> Said:
+        """A person's op: its place in the log, or why nothing came of it. Said twice it is answered twice, done once.
+
+        `extra`: what the hub itself adds to it.
+        """
+        what = op.what
+        payload = what.model_dump(mode="json", exclude={"kind"}, exclude_none=what.kind in ("put", "undo"))
+        payload |= extra or {}
+        if what.kind == "put":
+            payload["stroke"] = {k: v for k, v in payload["stroke"].items() if v is not None}
+        why = refusal(speaker, what.kind, self.clock.now_ns())
+        if not self.accounts.allowed(speaker.person):
+            why = "your account was closed, or your invitation has ended"
+        if why:
+            payload = {}
+        elif what.kind == "stop" and self.lit(case):
+            self.dark(f"stopped by {speaker.person}")
+        return await self._put(
+            case, speaker.person, speaker.role.value, what.kind, payload, op.client, op.number, op.at_ns, why
+        )
+
+    async def tell(self, case: str, word: What) -> Said:
+        """A word of the instrument, for the examination of a case."""
+        plain = examination.to_dict(word)
+        return await self.note(case, INSTRUMENT, INSTRUMENT, plain.pop("kind"), plain)
+
+    async def note(
+        self, case: str, actor: str, role: str, kind: str, payload: dict[str, Any],
+        beside: Callable[[sa.Connection], None] | None = None,
+    ) -> Said:  # fmt: skip
+        """An event that the hub itself writes down, with what `beside` changes in the same transaction."""
+        self._numbers += 1
+        return await self._put(case, actor, role, kind, payload, self._run, self._numbers, 0, "", beside)
+
+    async def _put(
+        self, case: str, actor: str, role: str, kind: str, payload: dict[str, Any], client: str, number: int,
+        said_ns: int, refused: str, beside: Callable[[sa.Connection], None] | None = None,
+    ) -> Said:  # fmt: skip
+        answer: asyncio.Future[Said] = asyncio.get_running_loop().create_future()
+        self._queue.put_nowait(
+            _Waiting(case, actor, role, kind, payload, client, number, said_ns, refused, answer, beside)
+        )
+        return await answer
+
+    # ------------------------------------------------------------------------------------------------------ knowing
+
+    async def truth_of(self, case: str) -> tuple[truth.Truth, int]:
+        """Where a case stands, and after which event."""
+        book = await self._book(case)
+        return book.truth, book.seq
+
+    def lit(self, case: str) -> bool:
+        """Whether something of a case may be on the projector."""
+        book = self._books.get(case)
+        return book is not None and any(v.phase is Phase.PROJECTING for v in book.truth.exam.versions)
+
+    async def _book(self, case: str) -> Book:
+        if case not in self._books:
+            made = await self._in_thread(lambda: self._read(case))
+            self._books.setdefault(case, made)
+        book = self._books.pop(case)
+        self._books[case] = book  # the latest used stays longest
+        for old in list(self._books)[: max(0, len(self._books) - _BOOKS)]:
+            if not self.lit(old) and not self._books[old].truth.exam.guarded:
+                del self._books[old]
+        return book
+
+    def _read(self, case: str) -> Book:
+        book = Book(truth.Truth(), 0, GENESIS, {})
+        for r in journal.entries(self.engine, case):
+            if not r.refused:
+                book.truth = truth.follow(book.truth, r, self._settings).truth
+            book.seq, book.head = r.seq, r.hash
+            book.said.setdefault((r.actor, r.client), {})[r.number] = (r.seq, r.refused)
+        return book
+
+    async def _in_thread(self, work: Callable[[], Any]) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._writer, work)
+
+    # ------------------------------------------------------------------------------------------------------ writing
+
+    async def _write(self) -> None:
+        while True:
+            waiting = [await self._queue.get()]
+            while len(waiting) < _BATCH and not self._queue.empty():
+                waiting.append(self._queue.get_nowait())
+            try:
+                await self._take(waiting)
+            except Exception as e:  # a fault of ours must not end the hub: these words did not happen
+                for w in waiting:
+                    if not w.answer.done():
+                        w.answer.set_exception(e)
+            finally:
+                for _ in waiting:
+                    self._queue.task_done()
+
+    async def _take(self, waiting: list[_Waiting]) -> None:
+        batch = _Batch()
+        try:
+            for w in waiting:
+                self._place(batch, w, await self._book(w.case))
+            await self._in_thread(lambda: self._commit(batch))
+        except Exception as e:
+            for case, book in batch.before.items():
+                self._books[case] = book
+            if not isinstance(e, FringescopeError):
+                raise
+            for w in waiting:
+                w.answer.set_result(Said(client=w.client, number=w.number, seq=None, refused=str(e)))
+            return
+        for w, said in batch.answers:
+            if not w.answer.done():
+                w.answer.set_result(said)
+        for w, record, fold in batch.folds:
+            self.rooms.event(w.case, as_event(record))
+            await self._follow_up(w.case, record, fold)
+
+    def _place(self, batch: _Batch, w: _Waiting, book: Book) -> None:
+        """Gives a word its place, unless it has one."""
+        earlier = book.said.get((w.actor, w.client), {}).get(w.number)
+        if earlier is not None:
+            said = Said(client=w.client, number=w.number, seq=earlier[0], refused=earlier[1])
+            batch.answers.append((w, said))
+            return
+        batch.before.setdefault(w.case, replace(book, said={k: dict(v) for k, v in book.said.items()}))
+        bare = Record(
+            w.case, book.seq + 1, self.clock.now_ns(), w.said_ns, w.actor, w.role, w.client, w.number, w.kind,
+            w.refused, secrets.token_hex(16), w.payload, "", "",
+        )  # fmt: skip
+        fold = truth.Fold(book.truth, w.payload, refused=w.refused)
+        if not w.refused:
+            fold = truth.follow(book.truth, bare, self._settings)
+        record = link(replace(bare, payload=fold.payload, refused=fold.refused), book.head)
+        book.truth, book.seq, book.head = fold.truth, record.seq, record.hash
+        book.said.setdefault((w.actor, w.client), {})[w.number] = (record.seq, record.refused)
+        batch.records.append(record)
+        if w.beside is not None and not record.refused:
+            batch.beside.append(w.beside)
+        batch.folds.append((w, record, fold))
+        said = Said(client=w.client, number=w.number, seq=record.seq, refused=record.refused)
+        batch.answers.append((w, said))
+
+    def _commit(self, batch: _Batch) -> None:
+        try:
+            with db.writing(self.engine) as c:
+                for beside in batch.beside:
+                    beside(c)
+                journal.append(c, batch.records)
+        except sa.exc.DatabaseError as e:
+            raise OutputError(f"the log cannot be written: {e.orig}; nothing was changed") from e
+
+    async def _follow_up(self, case: str, record: Record, fold: truth.Fold) -> None:
+        if fold.refused:
+            return
+        for effect in fold.effects:
+            if isinstance(effect, Warn):
+                self.rooms.warn(case, Warned(text=effect.text))
+            elif isinstance(effect, Dark):
+                self.dark(effect.why)
+        if record.kind not in _DRAWN:
+            self.rooms.standing(case, Standing(seq=record.seq, state=truth.standing(fold.truth)))
+        if fold.effects or record.kind == "preview":
+            await self.carry_out(record, fold)
+
+    async def _tick(self) -> None:
+        """What the clock makes true."""
+        while True:
+            await asyncio.sleep(0.05)
+            for case, book in list(self._books.items()):
+                if any(v.phase in (Phase.ARMED, Phase.PROJECTING) for v in book.truth.exam.versions):
+                    for word in examination.due(book.truth.exam, self.clock.now_ns(), self._settings):
+                        await self.tell(case, word)
+
+
+_DRAWN = ("put", "remove", "layer", "comment", "withdraw", "undo", "opened", "changed", "invited", "joined")
+
+
+def as_event(r: Record) -> Event:
+    """An entry of the log as the room hears it."""
+    return Event(
+        seq=r.seq, at_ns=r.at_ns, actor=r.actor, role=r.role, client=r.client, number=r.number, kind=r.kind,
+        refused=r.refused, payload=r.payload, hash=r.hash,
+    )  # fmt: skip
+
+
+async def _nobody(_record: Record, _fold: truth.Fold) -> None:
+    """A hub without an instrument carries out nothing."""

@@ -1,0 +1,342 @@
+"""What the instrument's process does: it holds the devices, projects under a watchdog, and keeps looking meanwhile.
+
+It projects only pictures that were loaded before, by their hash, and only while the hub gives signs of life: without
+one for a second, or when the hub is gone, it is dark. A stale or lost specimen makes dark here, before the hub hears
+of it; a suspect one gets its dashed lines here.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fringescope import capture as capturing
+from fringescope import export, fuse, patterns, phase, store
+from fringescope.devices import registry
+from fringescope.devices.base import Station
+from fringescope.devices.watchdog import Guard, described
+from fringescope.errors import CaptureError, DeviceError, FringescopeError, RejectedError
+from fringescope.pipeline import guidance as recipe
+from fringescope.pipeline import projecting, watching
+from fringescope.server.processes.child import Call
+from fringescope.settings import Settings, from_dict
+from fringescope.store.images import decode_png
+from fringescope.types import U8, Standing, ViewInput
+
+Emit = Callable[[dict[str, Any]], None]
+Lock = AbstractContextManager[Any]
+LEASE_S = 1.0  #: how long the hub may be silent while something is projected
+
+
+class _Ready:
+    """What is ready to be projected: its pictures by hash, a guard, and a thread that looks at the specimen."""
+
+    def __init__(
+        self, station: Station, scan: str, look: Callable[[_Ready], Any], s: Settings, emit: Emit, cameras: Lock
+    ) -> None:  # fmt: skip
+        self.station, self.scan, self.s = station, scan, s
+        self._emit, self._cameras = emit, cameras
+        self.images: dict[str, U8] = {}
+        self.pair: tuple[str, str] | None = None  #: what is shown, whole and dashed
+        self.standing: Standing | None = None
+        self._lit: U8 | None = None
+        self._look, self._over = look, threading.Event()
+        self._failed = 0
+        self.guard = Guard(station.projector, s.guard)
+        self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
+
+    def begin(self) -> None:
+        """Looks for the first time, which takes longest, and only then starts what must not be kept waiting."""
+        self.look()
+        self.guard.start()
+        self.guard.lease(LEASE_S)
+        self._thread.start()
+
+    def look(self) -> None:
+        """Looks once; what is no longer true goes dark here and now."""
+        before = self.pair
+        try:
+            with self._cameras:
+                verdict = self._look(self)
+        except FringescopeError as e:
+            self._failed += 1
+            if self._failed > 2:
+                self.pair = None
+                self.station.projector.dark()
+                self._emit({"lost": "cameras", "why": str(e)})
+            return
+        self._failed = 0
+        if self.pair != before:
+            return  # what was projected changed meanwhile: this picture tells nothing
+        self.standing = verdict.verdict
+        if verdict.verdict is Standing.STALE:
+            self.pair = None
+            self.station.projector.dark()
+        elif self.pair is not None:
+            self._show()
+        self._emit({"watched": self.scan, "validity": verdict.verdict.value, "note": verdict.why[:200]})
+
+    def show(self, whole: str, dashed: str) -> None:
+        """Projects one of two loaded pictures, as the specimen's standing asks."""
+        if self.standing is None or self.standing is Standing.STALE:
+            raise RejectedError("the specimen is not as it was scanned; scan again")
+        for h in (whole, dashed):
+            if h not in self.images:
+                raise RejectedError(f"picture {h[:12]} was not loaded; preview it again")
+        self.pair = whole, dashed
+        self._show()
+
+    def _show(self) -> None:
+        if self.pair is None:
+            return
+        image = self.images[self.pair[self.standing is Standing.SUSPECT]]
+        grey = not self.station.projector.info.colours
+        if self.station.projector.shown is None or self._lit is not image:
+            self.station.projector.show(np.asarray(image.max(axis=2)) if grey else image)
+            self._lit = image
+
+    def dark(self) -> None:
+        self.pair = None
+        self.station.projector.dark()
+
+    def _watch(self) -> None:
+        while not self._over.wait(self.s.loop.look_s):
+            if self.guard.lost:
+                self.pair = None
+                self._emit({"guard": "lost", "why": self.guard.lost})
+                return
+            self.look()
+
+    def close(self) -> None:
+        self._over.set()
+        self.dark()
+        self.guard.close()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(self.s.loop.patience_s)
+
+
+class Hand:
+    """The devices, in the hand of one process; its calls come one by one, `dark` and `beat` at any time."""
+
+    def __init__(self, emit: Emit) -> None:
+        self._emit = emit
+        self._cameras = threading.Lock()  #: one at a time takes pictures
+        self._station: Station | None = None
+        self._uri = ""
+        self._ready: _Ready | None = None
+        self.calls: dict[str, Callable[..., Any]] = {
+            "open": self.open_, "close": self.close, "capture": self.capture, "ready": self.ready, "rest": self.rest,
+            "look": self.look, "live": self.live, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
+        }  # fmt: skip
+        self.urgent: dict[str, Callable[..., Any]] = {"dark": self.dark, "beat": self.beat}
+
+    def _opened(self) -> Station:
+        if self._station is None:
+            raise DeviceError("the instrument is not open; open it first")
+        return self._station
+
+    def ended(self) -> None:
+        """The hub is gone: dark."""
+        if self._ready is not None:
+            self._ready.dark()
+        if self._station is not None:
+            self._station.projector.dark()
+            self._station.close()
+
+    def open_(self, _call: Call, uri: str) -> dict[str, Any]:
+        """Opens the devices; returns what they are."""
+        if self._station is None or uri != self._uri:
+            self.close(_call)
+            self._station, self._uri = registry.open_station(uri), uri
+        i = self._station.projector.info
+        cameras = [
+            {"name": c.info.serial, "width": c.info.width, "height": c.info.height,
+             "pixel_format": c.info.pixel_formats[0].value}
+            for c in self._station.cameras
+        ]  # fmt: skip
+        return {"uri": uri, "projector": {"width": i.width, "height": i.height}, "cameras": cameras}
+
+    def close(self, _call: Call) -> None:
+        """Dark, and the devices are free for others."""
+        self.rest(_call)
+        if self._station is not None:
+            self._station.close()
+        self._station, self._uri = None, ""
+
+    def capture(self, call: Call, rig: str, out: str, settings: dict[str, Any]) -> dict[str, Any]:
+        """Photographs the specimen and plays the fringes; a capture in a new folder."""
+        station, s = self._opened(), from_dict(settings)
+        self.rest(call)
+        r = store.read_rig(Path(rig))
+        formats = {c.info.serial: c.info.pixel_formats[0] for c in station.cameras}
+        plan = patterns.paper_plan(r, formats, s.patterns)
+        by_name = {c.info.serial: c for c in station.cameras}
+        cameras = [by_name[v.camera] for v in plan.views]
+        total = sum(len(v.keys) for v in plan.views)
+        done = 0
+        call.progress("photographs", 0.0)
+        photos: tuple[Any, ...] = (None,) * len(cameras)
+        if station.light is not None:
+            wanted = [v.pixel_format for v in plan.views]
+            photos = capturing.photograph(station.projector, cameras, station.light, wanted, s.capture)
+
+        def counted(frames: Any, camera: str) -> Iterator[Any]:
+            nonlocal done
+            for item in frames:
+                done += 1
+                call.progress(f"fringes {camera}", 0.1 + 0.9 * done / total)
+                yield item
+
+        def views() -> Iterator[ViewInput]:
+            for view, camera, photo in zip(plan.views, cameras, photos, strict=True):
+                shown = patterns.images(view, r.projector, s.patterns)
+                frames = capturing.stream(station.projector, camera, shown, view, s.capture)
+                yield ViewInput(view, counted(frames, view.camera), photo)
+
+        p = r.projector
+        try:
+            with store.new_folder(Path(out), marker="capture.json") as tmp:
+                store.put_capture(tmp, p.width, p.height, p.layout, views(), {"instrument": self._uri})
+        finally:
+            station.projector.dark()
+        return {"views": [v.camera for v in plan.views], "frames": total}
+
+    def ready(
+        self, call: Call, scan: str, scan_id: str, rig: str, pictures: dict[str, str], settings: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Starts the watchdog and the looking, and loads pictures (hash to file) that may be projected later."""
+        station, s = self._opened(), from_dict(settings)
+        images = {h: _read_png(path, h) for h, path in pictures.items()}
+        if self._ready is None or self._ready.scan != scan_id or self._ready.guard.lost:
+            self.rest(call)
+            station.projector.release()
+            stored = store.read_scan(Path(scan), check=False)
+            r = store.read_rig(Path(rig))
+            photos, noise = stored.every_picture(), stored.noise()
+            if stored.surface is None:
+                raise CaptureError("the scan has no surface, so nothing was drawn on it; scan again")
+            tissue = recipe.tissue_of(stored.grids, export.read_glb(stored.surface), r, s)
+            cache: dict[tuple[str, str], Any] = {}
+
+            def look(now: _Ready) -> Any:
+                masks = None
+                if now.pair is not None:
+                    if now.pair not in cache:
+                        cache.clear()
+                        cache[now.pair] = _masks(now.images[now.pair[0]], tissue)
+                    masks = cache[now.pair]
+                return watching.watch(station, stored.grids, photos, r, s, noise=noise, masks=masks)
+
+            made = _Ready(station, scan_id, look, s, self._emit, self._cameras)
+            made.begin()
+            self._ready = made
+        self._ready.images.update(images)
+        standing = self._ready.standing
+        return {"guarded": True, "validity": None if standing is None else standing.value, "stop": self.stop_button()}
+
+    def stop_button(self) -> dict[str, Any]:
+        """What turns the projector dark from the hub's process, whatever this one does."""
+        assert self._ready is not None
+        button = self._ready.guard.button()
+        return {"switch": described(button.switch), "patience_ms": button.patience_ms}
+
+    def show(self, _call: Call, whole: str, dashed: str) -> dict[str, Any]:
+        """Projects a loaded picture."""
+        if self._ready is None:
+            raise RejectedError("nothing is ready to be projected; preview it again")
+        if self._ready.guard.lost:
+            raise RejectedError(f"the projector is dark ({self._ready.guard.lost}); preview it again")
+        self._ready.guard.lease(LEASE_S)
+        self._ready.show(whole, dashed)
+        return {"shown_ns": time.time_ns()}
+
+    def rest(self, _call: Call) -> None:
+        """Dark, no watchdog, nobody looks: the devices are free."""
+        if self._ready is not None:
+            self._ready.close()
+            self._ready = None
+
+    def look(self, _call: Call) -> dict[str, Any]:
+        """Looks at the specimen once, now."""
+        if self._ready is None:
+            raise RejectedError("nothing is ready to be projected; preview it first")
+        self._ready.look()
+        return {"validity": None if self._ready.standing is None else self._ready.standing.value}
+
+    def live(self, _call: Call, camera: str, width: int, quality: int) -> dict[str, Any]:
+        """What a camera sees now, as JPEG in base64, at most so wide."""
+        import cv2
+
+        station = self._opened()
+        found = next((c for c in station.cameras if c.info.serial == camera), None)
+        if found is None:
+            raise DeviceError(f"no camera {camera}; there are {', '.join(c.info.serial for c in station.cameras)}")
+        if station.light is None:
+            raise DeviceError("this instrument has no light to see by")
+        fmt = found.info.pixel_formats[0]
+        at = time.time_ns()
+        with self._cameras:
+            frame = capturing.look([found], station.light, [fmt], Settings().capture)[0]
+        photo = fuse.photo(phase.unpacked(frame, fmt), fmt, camera, Settings().fuse).rgb
+        if photo.shape[1] > width:
+            size = width, max(1, round(photo.shape[0] * width / photo.shape[1]))
+            photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        good, data = cv2.imencode(".jpg", photo[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+        assert good
+        return {"at_ns": at, "jpeg": base64.b64encode(data.tobytes()).decode()}
+
+    def beat(self, _call: Call) -> None:
+        """The hub lives. Without this for a second, what is projected goes dark."""
+        now = self._ready
+        if now is not None and not now.guard.lost:
+            now.guard.lease(LEASE_S)
+
+    def dark(self, _call: Call) -> dict[str, Any]:
+        """Dark at once, whatever is being done."""
+        now = self._ready
+        if now is not None:
+            now.dark()
+        if self._station is not None:
+            self._station.projector.dark()
+        return {"dark_ns": time.time_ns()}
+
+    def befall(self, _call: Call, what: dict[str, str]) -> None:
+        """For the simulated instrument alone: what befalls the specimen, as `twin.changes.changed` takes it."""
+        from fringescope.devices.simulated import SimulatedStation
+        from fringescope.twin import changes
+
+        station = self._opened()
+        if not isinstance(station, SimulatedStation):
+            raise DeviceError("this instrument is not simulated; move the specimen by hand")
+        station.world.change(changes.changed(station.world.scene, what))
+
+    def twin_rig(self, _call: Call, out: str) -> str:
+        """For the simulated instrument alone: its true rig, as a file."""
+        from fringescope.devices.simulated import SimulatedStation
+
+        station = self._opened()
+        if not isinstance(station, SimulatedStation):
+            raise DeviceError("this instrument is not simulated; calibrate it, and name its rig with --rig")
+        store.write_rig(Path(out), station.rig, force=True)
+        return out
+
+
+def _masks(image: U8, tissue: Any) -> Any:
+    from fringescope.types import Guidance
+
+    return projecting.lit_masks(Guidance(image, ()), tissue)
+
+
+def _read_png(path: str, sha256: str) -> U8:
+    data = Path(path).read_bytes()
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise RejectedError(f"{path}: is not the picture {sha256[:12]} that was confirmed; nothing is projected")
+    return np.asarray(decode_png(data, Path(path)), np.uint8)

@@ -1,0 +1,142 @@
+"""Who listens to which case, and what each of them has still to be sent.
+
+Events are never dropped: a listener that does not read is let go, and comes back with the number of the last event
+that it has seen. Pointers, views and ink are dropped first: only the latest of each person waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+
+from fringescope.server.rights import Speaker
+from fringescope.wire import PersonRole
+from fringescope.wire.room import Event, Presence, Relayed, Standing, Warned
+
+TOO_SLOW = (1013, "you read too slowly; come back with the number of the last event that you have seen")
+EXPELLED = (4403, "your right to see this case has ended")
+OVER = (1012, "the hub stops; come back")
+
+
+class Listener:
+    """One connection to a room: a queue with an end."""
+
+    def __init__(self, speaker: Speaker, most: int) -> None:
+        self.speaker = speaker
+        self.ended: tuple[int, str] | None = None
+        self._most = most
+        self._lines: deque[str] = deque()
+        self._live: dict[tuple[str, str], str] = {}  #: the latest pointer, view or ink of each person
+        self._wake = asyncio.Event()
+
+    def send(self, line: str) -> None:
+        """A message that must arrive."""
+        if self.ended is None:
+            self._lines.append(line)
+            if len(self._lines) > self._most:
+                self.end(TOO_SLOW)
+            self._wake.set()
+
+    def send_live(self, key: tuple[str, str], line: str) -> None:
+        """A message of which only the latest counts. Ink is a line of pieces: it waits in order while there is room."""
+        if self.ended is not None:
+            return
+        if key[1] == "ink" and len(self._lines) < self._most // 4:
+            self._lines.append(line)
+        else:
+            self._live[key] = line
+        self._wake.set()
+
+    def end(self, why: tuple[int, str]) -> None:
+        """No more messages: code and reason for the browser."""
+        if self.ended is None:
+            self.ended = why
+            self._lines.clear()
+            self._live.clear()
+        self._wake.set()
+
+    async def next(self) -> list[str]:
+        """What waits, once something does; nothing at all when it has ended."""
+        while not (self._lines or self._live or self.ended):
+            self._wake.clear()
+            await self._wake.wait()
+        out = [*self._lines, *self._live.values()]
+        self._lines.clear()
+        self._live.clear()
+        return out
+
+
+class Rooms:
+    """The listeners of all cases. Lives on one event loop."""
+
+    def __init__(self, most: int = 4000) -> None:
+        self._most = most
+        self._rooms: dict[str, set[Listener]] = {}
+
+    def join(self, case: str, speaker: Speaker) -> Listener:
+        """A new listener; the others hear of it."""
+        made = Listener(speaker, self._most)
+        self._rooms.setdefault(case, set()).add(made)
+        self._presence(case)
+        return made
+
+    def leave(self, case: str, listener: Listener) -> None:
+        """One listener less."""
+        room = self._rooms.get(case, set())
+        room.discard(listener)
+        if room:
+            self._presence(case)
+        else:
+            self._rooms.pop(case, None)
+
+    def present(self, case: str) -> list[str]:
+        """Who is there."""
+        return sorted({x.speaker.person for x in self._rooms.get(case, ())})
+
+    def count(self, case: str) -> int:
+        """How many connections there are."""
+        return len(self._rooms.get(case, ()))
+
+    def expel(self, person: str, case: str | None = None) -> None:
+        """Closes whatever somebody has open, in one case or in all."""
+        for name, room in self._rooms.items():
+            for listener in room:
+                if listener.speaker.person == person and case in (None, name):
+                    listener.end(EXPELLED)
+
+    def end(self) -> None:
+        """Closes all."""
+        for room in self._rooms.values():
+            for listener in room:
+                listener.end(OVER)
+
+    def event(self, case: str, event: Event) -> None:
+        """An event, for all."""
+        self._all(case, event.model_dump_json())
+
+    def standing(self, case: str, standing: Standing) -> None:
+        """How things stand, for all."""
+        self._all(case, standing.model_dump_json())
+
+    def warn(self, case: str, warned: Warned) -> None:
+        """A warning, for the operators."""
+        line = warned.model_dump_json()
+        for listener in list(self._rooms.get(case, ())):
+            if listener.speaker.role is PersonRole.OPERATOR:
+                listener.send(line)
+
+    def relay(self, case: str, sender: Listener, relayed: Relayed) -> None:
+        """What somebody points at, sees or draws, for the others."""
+        line, key = relayed.model_dump_json(), (relayed.person, relayed.what.type)
+        for listener in self._rooms.get(case, ()):
+            if listener is not sender:
+                listener.send_live(key, line)
+
+    def _presence(self, case: str) -> None:
+        line = Presence(present=self.present(case)).model_dump_json()
+        for listener in self._rooms.get(case, ()):
+            listener.send_live(("", "presence"), line)
+
+    def _all(self, case: str, line: str) -> None:
+        for listener in list(self._rooms.get(case, ())):
+            listener.send(line)

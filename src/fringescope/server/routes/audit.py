@@ -1,0 +1,26 @@
+"""The log judged, and the hub's own health."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from fringescope import __version__
+from fringescope.server import journal
+from fringescope.server.asking import Parts, Who, problems
+from fringescope.wire.documents import AuditReport, Health
+
+router = APIRouter(prefix="/api", tags=["hub"])
+
+
+@router.get("/audit", responses=problems(401, 403))
+def audit(who: Who) -> AuditReport:
+    """Checks the chains of all cases; altered or removed events are named."""
+    who.must("audit")
+    found, events, faults = journal.check(who.site.engine)
+    return AuditReport(cases=found, events=events, faults=faults[:1000], whole=not faults)
+
+
+@router.get("/health", responses=problems())
+def health(site: Parts) -> Health:
+    """Whether the hub lives. Tells nothing else to strangers."""
+    return Health(version=__version__, room=site.blobs.free_bytes() > 1 << 30)

@@ -1,0 +1,247 @@
+"""The room of a case: one WebSocket for all that happens, and one for live video."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import json
+import time
+from typing import Any
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from pydantic import TypeAdapter, ValidationError
+from starlette.concurrency import run_in_threadpool
+
+from fringescope.errors import DeviceError, FringescopeError
+from fringescope.server import database as db
+from fringescope.server import journal, truth
+from fringescope.server.accounts import SignInError
+from fringescope.server.asking import Asking, asking_of, may_see
+from fringescope.server.hub import as_event
+from fringescope.server.rights import refusal
+from fringescope.server.rooms import EXPELLED, Listener
+from fringescope.server.security import origin_fits
+from fringescope.server.throttle import Bucket
+from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Relayed, Say, Standing, Welcome
+
+router = APIRouter()
+_MESSAGE: TypeAdapter[Any] = TypeAdapter(FromClient)
+_PAGE = 500
+
+
+async def _enter(socket: WebSocket, case: str, what: str) -> Asking | None:
+    """Who comes in, or None after the door was closed with a reason."""
+    site = socket.app.state.site
+    if not origin_fits(socket.scope, site.config):
+        await _close(socket, 4403, "this connection comes from another site's page; open the hub's own page")
+        return None
+    try:
+        asking = await run_in_threadpool(asking_of, socket)
+    except SignInError as e:
+        await _close(socket, 4401, str(e))
+        return None
+    seen = await run_in_threadpool(may_see, site, asking.speaker, case)
+    why = refusal(asking.speaker, what) or ("" if seen else "there is no such case, or you were not invited to it")
+    if why:
+        await _close(socket, 4404 if not seen else 4403, why)
+        return None
+    return asking
+
+
+async def _close(socket: WebSocket, code: int, why: str) -> None:
+    """Accepted first: a browser hears the reason only then."""
+    with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+        await socket.accept()
+        await socket.close(code, why.encode()[:120].decode(errors="ignore"))
+
+
+@router.websocket("/api/cases/{case}/room")
+async def room(socket: WebSocket, case: str, since: int = 0) -> None:
+    """All events behind number `since`, then all that come; ops, pointers and ink the other way."""
+    asking = await _enter(socket, case, "case.read")
+    if asking is None:
+        return
+    site = asking.site
+    if site.rooms.count(case) >= site.config.limits.present:
+        await _close(socket, 1013, "this room is full; try again later")
+        return
+    await socket.accept()
+    listener = site.rooms.join(case, asking.speaker)  # from here on nothing is missed
+    sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since)))
+    try:
+        await _receive(socket, asking, case, listener)
+    finally:
+        site.rooms.leave(case, listener)
+        sender.cancel()
+        with contextlib.suppress(asyncio.CancelledError, Exception):
+            await sender
+
+
+async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int) -> None:
+    site, who = asking.site, asking.speaker
+    now, seq = await site.hub.truth_of(case)
+    since = min(since, seq)
+    here = site.rooms.present(case)
+    hello = Welcome(person=who.person, role=who.role.value, local=who.local, seq=seq, present=here)
+    await socket.send_text(hello.model_dump_json())
+
+    def page(after: int) -> list[str]:
+        with db.reading(site.engine) as c:
+            return [as_event(r).model_dump_json() for r in journal.read(c, case, after, min(_PAGE, seq - after))]
+
+    while since < seq:
+        lines = await run_in_threadpool(page, since)
+        for line in lines:
+            await socket.send_text(line)
+        since += len(lines)
+    await socket.send_text(Standing(seq=seq, state=truth.standing(now)).model_dump_json())
+    await socket.send_text(CaughtUp(seq=seq).model_dump_json())
+    while True:
+        for line in await listener.next():
+            if line.startswith('{"type":"event"') and int(line[line.index('"seq":') + 6 :].split(",", 1)[0]) <= seq:
+                continue  # was sent already
+            await socket.send_text(line)
+        if listener.ended is not None:
+            await socket.close(*listener.ended)
+            return
+
+
+async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Listener) -> None:
+    site, limits = asking.site, asking.site.config.limits
+    live = Bucket(limits.live_per_s, 2 * limits.live_per_s)
+    waiting: set[asyncio.Task[None]] = set()
+    try:
+        while listener.ended is None:
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            text = message.get("text") or ""
+            if not site.accounts.allowed(asking.speaker.person):
+                listener.end(EXPELLED)
+                return
+            if len(text) > limits.message_bytes:
+                listener.send(_refused(f"a message of {len(text)} letters; at most {limits.message_bytes} are taken"))
+                continue
+            try:
+                said = _MESSAGE.validate_json(text)
+            except ValidationError as e:
+                listener.send(_refused(_why(e)))
+                continue
+            if isinstance(said, Ping):
+                listener.send(Pong(at_ms=said.at_ms).model_dump_json())
+            elif isinstance(said, Say):
+                await _say(asking, case, listener, said, waiting)
+            elif (why := refusal(asking.speaker, said.type)) or not live.take():
+                if why:
+                    listener.send(_refused(why))
+            else:
+                site.rooms.relay(case, listener, Relayed(person=asking.speaker.person, what=said))
+    finally:
+        for task in waiting:
+            with contextlib.suppress(Exception):
+                await task
+
+
+async def _say(asking: Asking, case: str, listener: Listener, said: Say, waiting: set[asyncio.Task[None]]) -> None:
+    """An op on its way to the log; a stop is never too often."""
+    what = said.op.what.kind
+    if what != "stop" and asking.site.ops.take(asking.speaker.person):
+        listener.send(_refused(f"op {said.op.number}: too many ops; wait a moment and say it again"))
+        return
+    if what == "carry_over":
+        listener.send(_refused("carry_over: use the route of that name, which looks the job up"))
+        return
+
+    async def answer() -> None:
+        try:
+            line = (await asking.site.hub.say(case, await _fresh(asking, what), said.op)).model_dump_json()
+        except FringescopeError as e:
+            line = _refused(str(e))
+        listener.send(line)
+
+    # the queue of the hub keeps the order: the task is in it before the next message is read
+    task = asyncio.create_task(answer())
+    waiting.add(task)
+    task.add_done_callback(waiting.discard)
+    await asyncio.sleep(0)
+
+
+async def _fresh(asking: Asking, what: str) -> Any:
+    """The speaker, with the time of the last confirmation where it matters."""
+    if what != "sign":
+        return asking.speaker
+    return (await run_in_threadpool(_renewed, asking)).speaker
+
+
+def _renewed(asking: Asking) -> Asking:
+    from dataclasses import replace
+
+    from fringescope.server.accounts import confirmed_ns
+
+    at = confirmed_ns(asking.site.engine, asking.session.digest)
+    return replace(asking, speaker=replace(asking.speaker, confirmed_ns=at))
+
+
+def _refused(why: str) -> str:
+    return Refusal(why=why).model_dump_json()
+
+
+def _why(e: ValidationError) -> str:
+    first = e.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(x) for x in first["loc"])
+    return f"a message that nobody understands: {where}: {first['msg']}"[:300]
+
+
+# -------------------------------------------------------------------------------------------------------------- video
+
+_FRAME_MS = 1000.0
+QUALITIES = ((640, 50), (960, 60), (1280, 70), (1920, 80))  #: widths and JPEG qualities, from a poor line to a good one
+
+
+@router.websocket("/api/cases/{case}/video/{camera}")
+async def video(socket: WebSocket, case: str, camera: str) -> None:
+    """What a camera sees: a line of JSON about a frame, the frame as JPEG, and the next once that was acknowledged.
+
+    Each frame carries the scan that the case stands at, and its time. Width and quality follow from how long it takes
+    until a frame is acknowledged.
+    """
+    asking = await _enter(socket, case, "video")
+    if asking is None:
+        return
+    site = asking.site
+    if site.instrument.watching >= site.config.limits.videos:
+        await _close(socket, 1013, "too many watch already; try again later")
+        return
+    await socket.accept()
+    site.instrument.watching += 1
+    level, number = 1, 0
+    try:
+        while site.accounts.allowed(asking.speaker.person):
+            width, quality = QUALITIES[level]
+            try:
+                frame = await site.instrument.live(camera, width, quality)
+            except DeviceError as e:
+                await socket.send_text(_refused(str(e)))
+                await asyncio.sleep(1.0)
+                continue
+            now, _ = await site.hub.truth_of(case)
+            data = base64.b64decode(frame["jpeg"])
+            number += 1
+            told = {"type": "frame", "number": number, "camera": camera, "at_ns": frame["at_ns"],
+                    "scan": now.exam.scan, "bytes": len(data), "width": width, "quality": quality}  # fmt: skip
+            begun = time.monotonic()
+            await socket.send_text(json.dumps(told))
+            await socket.send_bytes(data)
+            while True:
+                answer = json.loads(await asyncio.wait_for(socket.receive_text(), 30))
+                if isinstance(answer, dict) and answer.get("ack") == number:
+                    break
+            took = 1000 * (time.monotonic() - begun)
+            level = max(0, level - 1) if took > 250 else min(len(QUALITIES) - 1, level + 1) if took < 60 else level
+        await socket.close(*EXPELLED)
+    except (WebSocketDisconnect, TimeoutError, ValueError, RuntimeError):
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+            await socket.close(1000)
+    finally:
+        site.instrument.watching -= 1

@@ -1,0 +1,95 @@
+"""All parts of a running hub, put together once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import argon2
+
+from fringescope.errors import OutputError
+from fringescope.server import database as db
+from fringescope.server import journal
+from fringescope.server.accounts import Accounts
+from fringescope.server.blobs import Blobs
+from fringescope.server.clock import Clock
+from fringescope.server.config import Config
+from fringescope.server.hub import Hub
+from fringescope.server.instrument import Instrument
+from fringescope.server.invitations import Invitations
+from fringescope.server.jobs import Jobs
+from fringescope.server.rooms import Rooms
+from fringescope.server.throttle import Throttle
+
+
+@dataclass(eq=False)
+class Site:
+    """The parts; `app.state.site` holds them."""
+
+    config: Config
+    engine: Any
+    clock: Clock
+    blobs: Blobs
+    accounts: Accounts
+    invitations: Invitations
+    rooms: Rooms
+    hub: Hub
+    jobs: Jobs
+    instrument: Instrument
+    requests: Throttle
+    logins: Throttle
+    ops: Throttle
+    lock: int
+
+    def close(self) -> None:
+        """Lets go of the data folder and the database."""
+        self.engine.dispose()
+        os.close(self.lock)
+
+
+def hold(config: Config) -> int:
+    """Takes hold of the data folder: one hub at a time. Raises OutputError if another has it, or it cannot be made."""
+    try:
+        config.data.mkdir(parents=True, exist_ok=True)
+        config.data.chmod(0o700)
+        number = os.open(config.data / "hub.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as e:
+        raise OutputError(f"{config.data}: {e.strerror}; needed a folder that can be written") from e
+    try:
+        import fcntl
+
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:
+        pass  # where there is no such lock, the database's own has to do
+    except OSError:
+        os.close(number)
+        raise OutputError(f"{config.data}: another hub runs on this folder; stop it first") from None
+    return number
+
+
+def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Site:
+    """Opens the data of a hub and brings it to the present version. Raises OutputError and FormatError."""
+    lock = hold(config)
+    with contextlib.ExitStack() as undo:
+        undo.callback(os.close, lock)
+        engine = db.open_engine(config.url)
+        undo.callback(engine.dispose)
+        db.migrate(engine)
+        clock = Clock(journal.last_ns(engine))
+        blobs = Blobs(config.data / "files")
+        limits = config.limits
+        accounts = Accounts(engine, clock, limits, hasher)
+        rooms = Rooms(limits.waiting)
+        hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
+        jobs = Jobs(engine, clock)
+        accounts.gone = rooms.expel
+        site = Site(
+            config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
+            Instrument(hub, blobs, config), Throttle(limits.requests_per_s, limits.requests_burst),
+            Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
+            Throttle(limits.ops_per_s, limits.ops_burst), lock,
+        )  # fmt: skip
+        undo.pop_all()
+    return site

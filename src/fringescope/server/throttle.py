@@ -1,0 +1,53 @@
+"""How often somebody may ask: buckets that fill at a steady rate."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+_MOST = 20_000  #: buckets that are kept; the fullest go first
+
+
+class Bucket:
+    """Lets `burst` through at once, and `rate` a second after that."""
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self.rate, self.burst = rate, burst
+        self._level, self._at = burst, time.monotonic()
+
+    def take(self, n: float = 1) -> bool:
+        """Whether there is room for `n` more; they are counted if so."""
+        now = time.monotonic()
+        self._level = min(self.burst, self._level + self.rate * (now - self._at))
+        self._at = now
+        if self._level < n:
+            return False
+        self._level -= n
+        return True
+
+    @property
+    def wait_s(self) -> float:
+        """How long until there is room for one more."""
+        return max(0.0, (1 - self._level) / self.rate)
+
+    @property
+    def full(self) -> bool:
+        """Whether nobody has asked for long."""
+        return self._level + self.rate * (time.monotonic() - self._at) >= self.burst
+
+
+class Throttle:
+    """A bucket for each key, as an address. May be used from several threads."""
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._buckets: dict[str, Bucket] = {}
+        self._lock = threading.Lock()
+
+    def take(self, key: str, n: int = 1) -> float:
+        """0 if `key` may go on with `n` more, else how many seconds it should wait."""
+        with self._lock:
+            if len(self._buckets) > _MOST:
+                self._buckets = {k: b for k, b in self._buckets.items() if not b.full}
+            bucket = self._buckets.setdefault(key, Bucket(self._rate, self._burst))
+            return 0.0 if bucket.take(n) else max(1.0, bucket.wait_s)

@@ -1,0 +1,48 @@
+"""A hub that runs in this process, and people who are signed in at it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("fastapi", reason="needs fringescope[server]")
+
+from fringescope.client import Client
+from fringescope.server.config import Config
+from fringescope.server.running import Server
+from fringescope.wire import PersonRole
+
+PASSWORD = "correct horse battery"  # of everybody in these tests
+DEVICE = "sim://paper/tissue-domed?scale=0.06&seed=3"
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[Server]:
+    """A hub without an instrument; somebody of each role has an account, by the name of the role."""
+    with Server(Config(tmp_path / "hub", port=0), fast_passwords=True) as server:
+        populate(server)
+        yield server
+
+
+def populate(server: Server) -> None:
+    for role in PersonRole:
+        server.site.accounts.add(role.value, PASSWORD, role)
+
+
+SignIn = Callable[[str], Client]
+
+
+@pytest.fixture
+def sign_in(hub: Server) -> Iterator[SignIn]:
+    """Somebody by the name of their role."""
+    opened: list[Client] = []
+
+    def enter(name: str) -> Client:
+        opened.append(Client(hub.url, name, PASSWORD))
+        return opened[-1]
+
+    yield enter
+    for client in opened:
+        client.close()
