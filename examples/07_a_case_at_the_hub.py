@@ -1,8 +1,8 @@
-"""A case at the hub: an operator scans, an invited expert draws, the operator confirms, and light falls on the specimen.
+"""A case at the hub: an operator scans, an invited expert draws, the operator confirms, and light falls on the tissue.
 
     python examples/07_a_case_at_the_hub.py OUT [SCALE]
 
-The hub runs in this program, on the simulated instrument, with its data in OUT. Elsewhere it is `fringescope serve`, and
+The hub runs in this program, on the simulated instrument, its data in OUT. Elsewhere it is `fringescope serve`, and
 the two people are in two places; `fringescope.client` is the same. Needs the extra: pip install 'fringescope[server]'.
 """
 
