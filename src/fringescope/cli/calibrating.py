@@ -157,18 +157,32 @@ def calibrate(
 ) -> None:
     """Board captures to a calibrated rig, with the evidence to trust it."""
     from fringescope import calibrate as calibrate_
-    from fringescope import pipeline, store
-    from fringescope import report as report_
 
     s = load_settings(settings, set_)
     calibrate_.check(s.calibrate)
     existing(session, "a session: a folder with board.json and a capture per pose")
-    title = _title(session.resolve())
     page = report if report is not None else out.with_suffix(".html")
     if page.resolve() == out.resolve():
         raise UsageError(f"--report {page} is the rig itself; name another file")
+    with Progress() as progress:
+        c, evidence, why = calibrate_into(out, page, session, s, progress, load_response(response), force=force)
+    emit(_told(c, evidence, why, out, page), json, _lines(c, evidence, why, out, page))
+
+
+def calibrate_into(
+    out: Path, page: Path, session: Path, s: Settings, progress: Progress, response: Response | None = None, *,
+    force: bool = False,
+) -> tuple[Calibration, Evidence, list[str]]:  # fmt: skip
+    """Calibrates a session and writes the rig and its report; returns both, and why pictures were not used.
+
+    Raises CalibrationError where there is no rig; the report, which says why, is written all the same.
+    """
+    from fringescope import pipeline, store
+    from fringescope import report as report_
+
+    title = _title(session.resolve())
     looked, failure = Looked(), ""
-    with Progress() as progress, store.new_file(page, force=force) as page_file:
+    with store.new_file(page, force=force) as page_file:
         try:
             with store.new_file(out, force=force) as rig_file:
                 if session.is_file():
@@ -176,7 +190,7 @@ def calibrate(
                 else:
                     found = store.read_session(session)
                     board, sizes = found.board, _sizes(found)
-                    looked = look(found, s, progress, load_response(response))
+                    looked = look(found, s, progress, response)
                 why = [f"{name}: {why}" for name, why in looked.wrong.items()]
                 c, evidence = pipeline.calibrate_rig(looked.seen, board, sizes, s, progress.share, why)
                 store.write_json(rig_file, store.rig_document(rig_with_evidence(c, evidence, s)))
@@ -194,7 +208,7 @@ def calibrate(
             page_file.write_text(text, encoding="utf-8")
     if failure:
         raise CalibrationError(f"{failure}; see {page}")
-    emit(_told(c, evidence, why, out, page), json, _lines(c, evidence, why, out, page))
+    return c, evidence, why
 
 
 def _title(session: Path) -> str:

@@ -164,6 +164,10 @@ class Hub:
         book = await self._book(case)
         return book.truth, book.seq
 
+    def open_cases(self) -> list[str]:
+        """Cases whose truth is at hand: those that anybody has looked at lately."""
+        return list(self._books)
+
     def lit(self, case: str) -> bool:
         """Whether something of a case may be on the projector."""
         book = self._books.get(case)

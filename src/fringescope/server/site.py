@@ -20,7 +20,10 @@ from fringescope.server.hub import Hub
 from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
+from fringescope.server.lab import Lab
+from fringescope.server.processes.parent import Child
 from fringescope.server.rooms import Rooms
+from fringescope.server.shelf import Shelf
 from fringescope.server.throttle import Throttle
 
 
@@ -38,6 +41,7 @@ class Site:
     hub: Hub
     jobs: Jobs
     instrument: Instrument
+    lab: Lab
     requests: Throttle
     logins: Throttle
     ops: Throttle
@@ -85,9 +89,12 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
         accounts.gone = rooms.expel
+        shelf, workshop = Shelf(config.data, engine, blobs, config.rig), Child("fringescope.server.processes.workshop")
+        instrument = Instrument(hub, blobs, shelf, workshop, config)
         site = Site(
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
-            Instrument(hub, blobs, config), Throttle(limits.requests_per_s, limits.requests_burst),
+            instrument, Lab(hub, blobs, shelf, instrument, workshop, config),
+            Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
             Throttle(limits.ops_per_s, limits.ops_burst), lock,
         )  # fmt: skip
