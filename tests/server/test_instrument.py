@@ -235,6 +235,7 @@ def test_the_instrument_is_calibrated_from_here(operator: Client, case: HubCase)
     found = operator.calibrate().result
     assert found is not None
     assert found["rig"] != rig
+    assert found["selftest"]["ok"], found["selftest"]
     operator.befall(scene="tissue-domed")
     scan = case.scan("with the new rig").result
     assert scan is not None

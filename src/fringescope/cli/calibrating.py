@@ -149,13 +149,20 @@ def calibrate(
     report: Annotated[
         Path | None, typer.Option(help="The report, a page for any browser; else beside the rig, as RIG.html.")
     ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="URI", help="The instrument, with the board still under it: a cross grid is shown, too."),
+    ] = None,
     response: ResponseFile = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Board captures to a calibrated rig, with the evidence to trust it."""
+    """Board captures to a calibrated rig, with the evidence to trust it.
+
+    With --device the self-test follows: status 1 if the lines of a cross grid land too far from where they should.
+    """
     from fringescope import calibrate as calibrate_
 
     s = load_settings(settings, set_)
@@ -166,7 +173,26 @@ def calibrate(
         raise UsageError(f"--report {page} is the rig itself; name another file")
     with Progress() as progress:
         c, evidence, why = calibrate_into(out, page, session, s, progress, load_response(response), force=force)
-    emit(_told(c, evidence, why, out, page), json, _lines(c, evidence, why, out, page))
+        told, lines = _told(c, evidence, why, out, page), _lines(c, evidence, why, out, page)
+        landed = None if device is None else progress.run("self-test", lambda: cross_grid(device, out, s))
+    if landed is not None:
+        told["selftest"] = landed
+        lines.append(landed["words"])
+    emit(told, json, lines)
+    if landed is not None and not landed["ok"]:
+        raise typer.Exit(1)
+
+
+def cross_grid(device: str, rig: Path, s: Settings) -> dict[str, Any]:
+    """Projects a cross grid on the board under an instrument and measures it: the figures, and a line for people."""
+    from fringescope import store
+    from fringescope.devices import registry
+    from fringescope.pipeline.selftest import self_test
+
+    with registry.open_station(device) as station:
+        found = self_test(station, store.read_rig(rig), s)
+    figures = {"median_um": found.median_um, "p95_um": found.p95_um, "max_um": found.max_um, "ok": found.ok}
+    return {**figures, "limit_um": s.loop.accept_um, "words": found.words(s.loop.accept_um)}
 
 
 def calibrate_into(

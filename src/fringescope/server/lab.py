@@ -166,6 +166,10 @@ class Lab:
         )
         async with self._instrument.busy("taking the new rig") as devices:
             await devices.call("rest")
+            try:
+                found["selftest"] = await devices.call("selftest", tell, rig=str(made), settings=self._settings)
+            except FringescopeError as e:
+                found["selftest"] = {"ok": False, "words": f"no self-test: {e}"}
             self._shelf.use_rig(made, page)
         for case in self._hub.open_cases():
             truth, _ = await self._hub.truth_of(case)

@@ -27,6 +27,7 @@ from fringescope.devices.watchdog import Guard, described
 from fringescope.errors import CaptureError, DeviceError, FringescopeError, RejectedError
 from fringescope.pipeline import guidance as recipe
 from fringescope.pipeline import projecting, watching
+from fringescope.pipeline.selftest import self_test
 from fringescope.server.processes.child import Call
 from fringescope.settings import Settings, from_dict
 from fringescope.store.images import decode_png
@@ -155,6 +156,7 @@ class Hand:
         self.calls: dict[str, Callable[..., Any]] = {
             "open": self.open_, "close": self.close, "capture": self.capture, "ready": self.ready, "rest": self.rest,
             "look": self.look, "live": self.live, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
+            "selftest": self.selftest,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {"dark": self.dark, "beat": self.beat}
 
@@ -292,6 +294,18 @@ class Hand:
             raise RejectedError("nothing is ready to be projected; preview it first")
         self._ready.look()
         return {"validity": None if self._ready.standing is None else self._ready.standing.value}
+
+    def selftest(self, call: Call, rig: str, settings: dict[str, Any]) -> dict[str, Any]:
+        """Projects a cross grid on the board that lies there, and measures where its lines land."""
+        s = from_dict(settings)
+        call.progress("self-test", 0.0)
+        station = self._opened()
+        try:
+            found = self_test(station, store.read_rig(Path(rig)), s)
+        finally:
+            station.projector.dark()
+        figures = {"median_um": found.median_um, "p95_um": found.p95_um, "max_um": found.max_um}
+        return {**figures, "ok": found.ok, "words": found.words(s.loop.accept_um)}
 
     def live(self, _call: Call, camera: str, width: int, quality: int) -> dict[str, Any]:
         """What a camera sees now, as JPEG in base64, at most so wide."""
