@@ -317,6 +317,22 @@ def test_the_command_with_a_pattern_and_without_registration(scans: Path, tmp_pa
     assert doc["guidelines"][0]["median_mm"] < 0.5
 
 
+def test_strokes_are_drawn_as_guide_draws_them_and_a_bad_one_costs_itself_alone(scans: Path, tmp_path: Path) -> None:
+    document = json.loads((scans / "after" / "scan.json").read_text())
+    strokes = [
+        {"id": "ring", "kind": "circle", "camera": "camera1", "pixels": [[164, 110]], "radius_mm": 5.0},
+        {"id": "bad", "world_mm": [[0, 0, None], [1, 1, 1]]},
+    ]
+    drawn = tmp_path / "g.json"
+    bound = {"scan": document["hash"], "rig": document["rig"]}
+    drawn.write_text(json.dumps({"format": "fringescope-guidelines", "version": 1, **bound, "strokes": strokes}))
+    args = (scans / "after", scans / "before", "--rig", scans / "rig.json", "--guidelines", drawn)
+    assert run(*args, "--out", tmp_path / "out") == 0
+    doc = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert [g["id"] for g in doc["guidelines"]] == ["ring"]
+    assert any(w.startswith("bad: not compared: ") for w in doc["words"])
+
+
 def test_a_scan_without_a_surface_gives_its_points(scans: Path, tmp_path: Path) -> None:
     assert run(scans / "after", scans / "before", "--out", tmp_path / "back") == 0
     assert (tmp_path / "back" / "cloud.ply").is_file()
@@ -355,6 +371,7 @@ def test_bad_pairs_are_refused_in_one_line(scans: Path, tmp_path: Path, capsys: 
         ({"version": 2}, "version 2 is higher"),
         ({"strokes": []}, "missing or empty"),
         ({"strokes": [3]}, "needed an object"),
+        ({"strokes": [{"id": "a", "kind": "circle", "world_mm": [[1, 2, 3], [4, 5, 6]]}]}, "add --rig"),
         ({"strokes": [{"id": "a"}]}, "no world_mm, pixels or segments"),
         ({"strokes": [{"id": "a", "pixels": [[1, 2]]}]}, "no camera"),
         ({"strokes": [{"id": "a", "world_mm": [[1, 2]]}]}, "points of 3 finite numbers"),

@@ -64,7 +64,15 @@ def ready(room: Room, shift: float) -> HubVersion:
 
 
 def lit(room: Room, shift: float) -> HubVersion:
-    return room.start(room.arm(ready(room, shift)))
+    """It is lit. A machine that is busy enough loses its watchdog, which is safe: then the operator tries again."""
+    for attempt in range(4):
+        version = ready(room, shift + 0.05 * attempt)
+        try:
+            return room.start(room.arm(version))
+        except HubError as e:
+            if not any(w in str(e) for w in ("watchdog", "heartbeat", "preview it again")):
+                raise
+    raise AssertionError("four times made dark by a busy machine")
 
 
 def soon(true: Callable[[], bool], seconds: float = 10.0) -> bool:

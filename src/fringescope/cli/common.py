@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
 import typer
@@ -193,6 +195,23 @@ class Progress:
         out = work()
         self(stage, 1, 1)
         return out
+
+
+@contextmanager
+def until_interrupted() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C is the way to end here: it interrupts nothing, and the question whether somebody asked is answered."""
+    asked = threading.Event()
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        asked.set()
+
+    here = threading.current_thread() is threading.main_thread()
+    before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)} if here else {}
+    try:
+        yield asked.is_set
+    finally:
+        for n, handler in before.items():
+            signal.signal(n, handler)
 
 
 def existing(path: Path, what: str) -> Path:

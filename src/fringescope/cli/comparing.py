@@ -9,9 +9,12 @@ import typer
 
 from fringescope.cli.app import app
 from fringescope.cli.common import Force, Json, Out, Progress, SetOption, SettingsFile, emit, existing, load_settings
+from fringescope.errors import FormatError
 
 if TYPE_CHECKING:
     from fringescope.settings import Settings
+    from fringescope.store import StoredScan
+    from fringescope.types import F64, Cloud, Rig
 
 
 @app.command()
@@ -58,11 +61,8 @@ def compare_into(
     scans = [store.read_scan(existing(p, "a scan folder"), grids=False) for p in (before, after)]
     r = None if rig is None else store.read_rig(rig)
     store.check_pair(scans[0], scans[1], None if rig is None else store.hash_rig(rig))
-    document = scans[0].document
-    drawn = [] if guidelines is None else store.read_strokes(guidelines, document.get("hash"), document.get("rig"))
     first, second = (export.read_ply(x.cloud) for x in scans)
-    grids = store.read_scan(before, check=False).grids if any("pixels" in x for x in drawn) else ()
-    strokes = comparing.world_strokes(drawn, first, grids, r)
+    names, strokes, notes = _drawn(guidelines, scans[0], first, r, s) if guidelines is not None else ([], [], [])
     c = comparing.compare_scans(first, second, r, s, moved=register, strokes=strokes, progress=progress.share)
     surface = None if scans[1].surface is None else export.read_glb(scans[1].surface)
     title = f"{before.resolve().name} to {after.resolve().name}"
@@ -70,7 +70,7 @@ def compare_into(
         "writing",
         lambda: store.put_comparison(
             folder,
-            comparing.figures(c, [x["id"] for x in drawn]),
+            comparing.figures(c, names, notes),
             scans[0],
             scans[1],
             {"depth": c.change.depth, "sigma": c.change.sigma},
@@ -84,3 +84,30 @@ def compare_into(
         ),
     )
     return doc
+
+
+def _drawn(
+    guidelines: Path, before: StoredScan, cloud: Cloud, rig: Rig | None, s: Settings
+) -> tuple[list[str], list[F64], list[str]]:
+    """The strokes of a file as they lie on the first scan: names, polylines in mm, a line about each that is left out.
+
+    With a rig guidelines are drawn as `guide` draws them; without one, and of a pattern.json, their points are joined.
+    """
+    from fringescope import export, store
+    from fringescope.pipeline import comparing
+    from fringescope.pipeline import guidance as recipe
+
+    hashes = str(before.document.get("hash")), str(before.document.get("rig"))
+    if rig is not None and before.surface is not None and store.is_guidelines(guidelines):
+        asked = store.read_guidelines(guidelines)
+        recipe.check_bound(asked, *hashes)
+        grids = store.read_scan(before.folder, check=False).grids
+        tissue = recipe.tissue_of(grids, export.read_glb(before.surface), rig, s)
+        names, lines, words = comparing.traced(recipe.project_guidance(asked, tissue, s))
+        words += [f"{k}: not compared: {v}" for k, v in asked.refused.items()]
+        if not lines:
+            raise FormatError(f"{guidelines}: nothing to compare the cut with; " + "; ".join(words[:3]))
+        return names, lines, words
+    drawn = store.read_strokes(guidelines, *hashes)
+    grids = store.read_scan(before.folder, check=False).grids if any("pixels" in x for x in drawn) else ()
+    return [x["id"] for x in drawn], comparing.world_strokes(drawn, cloud, grids, rig), []

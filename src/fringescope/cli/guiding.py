@@ -14,7 +14,6 @@ import typer
 
 from fringescope.cli.app import app
 from fringescope.cli.common import (
-    INTERRUPTED,
     Force,
     Json,
     Progress,
@@ -24,6 +23,7 @@ from fringescope.cli.common import (
     existing,
     load_settings,
     say,
+    until_interrupted,
 )
 from fringescope.errors import EmptyResultError, FormatError, GuidanceError, UsageError
 
@@ -67,10 +67,13 @@ def guide(
     s = load_settings(settings, set_)
     if out.suffix.lower() != ".png":
         raise UsageError(f"--out {out}; needed the name of a PNG file, as pattern.png")
+    if show is not None and not 0 <= show < math.inf:
+        raise UsageError(f"--show {show:g}; needed seconds, 0 for until Ctrl-C")
     existing(guidelines, "a file with guidelines")
     record = out.with_name("pattern.json")
     if record.exists() and record.samefile(guidelines):
         raise UsageError(f"{guidelines} would be replaced by the record, pattern.json; choose another folder for --out")
+    store.check_replaced(record, force)
     with Progress() as progress:
         asked = store.read_guidelines(guidelines)
         stored = progress.run("reading the scan", lambda: store.read_scan(scan))
@@ -139,10 +142,11 @@ def _project(
     pictures, masks = stored.every_picture(), projecting.lit_masks(made, tissue)
     end = None if seconds <= 0 else time.monotonic() + seconds
 
-    def stop() -> bool:
-        return INTERRUPTED.is_set() or (end is not None and time.monotonic() > end)
+    with until_interrupted() as interrupted, registry.open_station(uri) as station:
 
-    with registry.open_station(uri) as station:
+        def stop() -> bool:
+            return interrupted() or (end is not None and time.monotonic() > end)
+
         ended = projecting.hold(
             station, lambda: Guard(station.projector, s.guard), made, dashed,
             lambda: watching.watch(station, stored.grids, pictures, tissue.rig, s, noise=stored.noise(), masks=masks),

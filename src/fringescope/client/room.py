@@ -296,6 +296,8 @@ class Room:
         """Until a version has come to one of these phases. Raises HubError if it goes elsewhere for good."""
         number = version if isinstance(version, int) else version.number
         over = {"stale", "superseded", "draft"} - set(phases)
+        if "projecting" in phases:
+            over |= {"stopped"} - set(phases)
 
         def there() -> HubVersion | None:
             v = self.version(number)

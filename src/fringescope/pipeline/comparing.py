@@ -13,7 +13,7 @@ import numpy as np
 from fringescope import compare, geometry, heights, register, report, specimen
 from fringescope.errors import EmptyResultError, RigError
 from fringescope.settings import Settings
-from fringescope.types import F64, U8, AnyArray, Bool, Cloud, Grid, Rig, Surface
+from fringescope.types import F64, U8, AnyArray, Bool, Cloud, Grid, Guidance, Rig, Surface
 
 Progress = Callable[[str, float], None]
 
@@ -55,9 +55,7 @@ def compare_scans(
     grounded = on_before is not None
     tell("registering", 0.2)
     if moved:
-        placed = register.register(
-            register.patch_of(before, on_before), register.patch_of(after, on_after), s.register
-        )
+        placed = register.register(register.patch_of(before, on_before), register.patch_of(after, on_after), s.register)
     else:
         placed = register.still(np.nanmedian(after.xyz, axis=0))
     tell("comparing", 0.5)
@@ -173,6 +171,22 @@ def from_projector(cloud: Cloud, rig: Rig, uv: AnyArray, reach: float = 4.0) -> 
     return np.where((finite & (d[:, 0] < reach)).reshape(-1, 1), out, np.nan)
 
 
+def traced(guidance: Guidance) -> tuple[list[str], list[F64], list[str]]:
+    """Strokes as they lie on the tissue, hidden parts too: their names, polylines (m, 3) in mm with NaN where a line is
+    broken, and a line about each that has none.
+    """
+    names, lines, words = [], [], []
+    gap = np.full((1, 3), np.nan)
+    for g in guidance.strokes:
+        pieces = [t.xyz[t.piece == n] for t in g.traces for n in np.unique(t.piece)]
+        if g.refused is not None or not pieces:
+            words.append(f"{g.stroke.id}: not compared: {g.refused or 'nothing of it lies on the tissue'}")
+            continue
+        names.append(g.stroke.id)
+        lines.append(np.concatenate([a for piece in pieces for a in (piece, gap)]))
+    return names, lines, words
+
+
 def world_strokes(
     strokes: Sequence[Mapping[str, Any]], cloud: Cloud, grids: Sequence[Grid], rig: Rig | None
 ) -> list[F64]:
@@ -251,11 +265,11 @@ def picture(c: Comparison, title: str) -> U8:
                                  ch.frame.local(ch.cut)[:, :2])  # fmt: skip
 
 
-def figures(c: Comparison, names: Sequence[str] = ()) -> dict[str, Any]:
-    """What compare.json says; `names` are those of the strokes."""
+def figures(c: Comparison, names: Sequence[str] = (), notes: Sequence[str] = ()) -> dict[str, Any]:
+    """What compare.json says; `names` are those of the strokes, `notes` about those that are left out."""
     r = c.registration
     return {
-        "words": list(c.words),
+        "words": [*c.words, *notes],
         "registration": {
             "R": r.T_new_old.R.tolist(),
             "t": r.T_new_old.t.tolist(),

@@ -18,7 +18,7 @@ from fringescope.errors import FringescopeError
 from fringescope.settings import Settings
 from fringescope.types import Bool, Guidance, Standing, Watched
 
-GLOW_MM = 1.0  #: so far around the projected lines the tissue glows too
+GLOW_MM = 2.5  #: so far around the projected lines the tissue, and the wall of a fold beside them, glow too
 
 
 class Guard(Protocol):

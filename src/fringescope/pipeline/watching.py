@@ -34,6 +34,7 @@ from fringescope.types import (
 from fringescope.types.capture import ROUNDING
 
 STEPS = 3  #: frames of the set that measures again: the fewest that tell phase, background and modulation
+STEPS_OF_A_PICTURE = 6  #: where the background is the picture: in that of 3 frames, what shines keeps its fringes
 BACKGROUND_NOISE = 0.25  #: of the variance of one sample that is left in a background of 8 and one of 3 frames, about
 
 
@@ -94,7 +95,8 @@ def watch(
     again: dict[str, Decoded] = {}
     for g, p, c in here if gradients is not None else ():
         model = (noise or {}).get(g.camera) or _usual(p.pixel_format)
-        plan = _plan(g, p.pixel_format, gradients or {}, rig)
+        steps = STEPS if p.light == "ring" else STEPS_OF_A_PICTURE
+        plan = _plan(g, p.pixel_format, gradients or {}, rig, steps)
         again[g.camera] = one = remeasured(station, rig, c, plan, model, s, freed_by)
         if p.light == "projector":
             codes = np.clip(np.rint(np.nan_to_num(one.sets[0].background)), 0, p.pixel_format.max_value)
@@ -139,7 +141,9 @@ def _check(station: Station, grids: Sequence[Grid], pictures: Sequence[Picture],
                            "measure again (--remeasure)")  # fmt: skip
 
 
-def _plan(g: Grid, fmt: PixelFormat, gradients: Mapping[str, Sequence[tuple[float, float]]], rig: Rig) -> ViewPlan:
+def _plan(
+    g: Grid, fmt: PixelFormat, gradients: Mapping[str, Sequence[tuple[float, float]]], rig: Rig, steps: int
+) -> ViewPlan:
     """The set that measures again: the finest fringes of the scan, of the direction that tells depth best."""
     found = gradients.get(g.camera, ())
     if not found:
@@ -149,7 +153,7 @@ def _plan(g: Grid, fmt: PixelFormat, gradients: Mapping[str, Sequence[tuple[floa
     ray = middle - geometry.centre(camera.pose)
     ends = np.stack([middle, middle + 0.1 * ray / np.linalg.norm(ray)])
     deepest = max(found, key=lambda x: abs(float(np.diff(geometry.phase_at(rig.projector, x, ends))[0])))
-    return ViewPlan(g.camera, fmt, (FringeSet(deepest, STEPS),), rig.projector.plane_size)
+    return ViewPlan(g.camera, fmt, (FringeSet(deepest, steps),), rig.projector.plane_size)
 
 
 def _usual(fmt: PixelFormat) -> NoiseModel:

@@ -249,12 +249,16 @@ class Instrument:
             self._busy = "getting ready"
             try:
                 await self.open()
-                files = {h: str(self._blobs.path(h)) for h in pictures}
-                found = await self._devices.call(
-                    "ready", scan=str(await self._shelf.scan(case, scan)), scan_id=scan,
-                    rig=str(self._shelf.rig_file()),
-                    pictures=files, settings=self._settings,
-                )  # fmt: skip
+                how: dict[str, Any] = {
+                    "scan": str(await self._shelf.scan(case, scan)), "scan_id": scan,
+                    "rig": str(self._shelf.rig_file()), "settings": self._settings,
+                    "pictures": {h: str(self._blobs.path(h)) for h in pictures},
+                }  # fmt: skip
+                try:
+                    found = await self._devices.call("ready", **how)
+                except DeviceLostError:  # a busy machine kept the watchdog waiting: nothing is lit yet, so once more
+                    await self.open()
+                    found = await self._devices.call("ready", **how)
             finally:
                 self._busy = ""
             self._case, self._lit_s = case, time.monotonic()

@@ -15,8 +15,10 @@ from fringescope.store.capture import (
 from fringescope.store.comparison import check_pair, put_comparison, read_strokes
 from fringescope.store.files import new_file, new_folder, write_json
 from fringescope.store.guidelines import (
+    check_replaced,
     check_stroke,
     guidelines_document,
+    is_guidelines,
     parse_guidelines,
     pattern_document,
     read_guidelines,
@@ -55,11 +57,13 @@ __all__ = [
     "board_document",
     "calibration_document",
     "check_pair",
+    "check_replaced",
     "check_rig",
     "check_stroke",
     "guidelines_document",
     "hash_capture",
     "hash_rig",
+    "is_guidelines",
     "lost",
     "new_file",
     "new_folder",

@@ -113,7 +113,10 @@ def read_strokes(path: Path | str, scan_hash: str | None, rig_hash: str | None) 
         if not isinstance(one, dict):
             raise FormatError(f"{path}: stroke {n + 1} is {files.shown(one)}; needed an object")
         name = str(one.get("id", n + 1))[:80]
-        stroke: dict[str, Any] = {"id": name, "closed": one.get("closed") is True}
+        if one.get("kind", "line") not in ("line", "region", "arrow") and "segments" not in one:
+            kind = files.shown(one.get("kind"))
+            raise FormatError(f"{path}: stroke '{name}' is of the kind {kind}; add --rig rig.json, which draws it")
+        stroke: dict[str, Any] = {"id": name, "closed": one.get("closed") is True or one.get("kind") == "region"}
         if "world_mm" in one:
             stroke["world_mm"] = _points(one["world_mm"], 3, path, name)
         elif "pixels" in one:

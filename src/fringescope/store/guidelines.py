@@ -11,7 +11,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from fringescope import __version__
-from fringescope.errors import FormatError, GuidanceError
+from fringescope.errors import FormatError, GuidanceError, OutputError
 from fringescope.store import files
 from fringescope.store.scan import plain
 from fringescope.types import Fill, Guidance, Guided, Guidelines, Landing, Side, Stroke, StrokeKind
@@ -41,6 +41,11 @@ def read_guidelines(path: Path | str) -> Guidelines:
     """
     path = Path(path)
     return parse_guidelines(files.read_json(path, "guidelines (a file with strokes)"), path)
+
+
+def is_guidelines(path: Path | str) -> bool:
+    """Whether a file says that it holds guidelines; a pattern.json does not. Raises FormatError for what is no JSON."""
+    return files.read_json(Path(path), "guidelines or a pattern.json").get("format") == FORMAT
 
 
 def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
@@ -188,6 +193,18 @@ def pattern_document(
         "strokes": strokes,
         **plain(extra or {}),
     }
+
+
+def check_replaced(record: Path, force: bool) -> None:
+    """Raises OutputError where `force` would replace a file that is no record of guidance."""
+    if not force or not record.exists():
+        return
+    try:
+        doc = files.read_json(record, "a record of guidance")
+    except FormatError:
+        doc = {}
+    if doc.get("format") != PATTERN_FORMAT:
+        raise OutputError(f"{record}: is no record of guidance and is not replaced; choose another folder for --out")
 
 
 def _entry(g: Guided, landed: Landing | None) -> dict[str, Any]:
