@@ -20,6 +20,8 @@ from fringescope.server.hub import Hub
 from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
+from fringescope.server.openid import OpenId
+from fringescope.server.passkeys import Passkeys
 from fringescope.server.rooms import Rooms
 from fringescope.server.throttle import Throttle
 
@@ -41,6 +43,8 @@ class Site:
     requests: Throttle
     logins: Throttle
     ops: Throttle
+    passkeys: Passkeys
+    provider: OpenId | None
     lock: int
 
     def close(self) -> None:
@@ -89,7 +93,8 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
             Instrument(hub, blobs, config), Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
-            Throttle(limits.ops_per_s, limits.ops_burst), lock,
+            Throttle(limits.ops_per_s, limits.ops_burst), Passkeys(engine, clock, accounts),
+            None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), lock,
         )  # fmt: skip
         undo.pop_all()
     return site

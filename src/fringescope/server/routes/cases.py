@@ -153,6 +153,8 @@ async def let_in(case: CaseId, person: str, who: Who) -> Person:
     known = who.site.accounts.person(person)
     if known is None:
         raise HTTPException(404, "nobody has this account")
+    if who.site.accounts.case_of(person) not in (None, case):
+        raise HTTPException(409, "a guest sees the one case of their invitation; invite them to this one, too")
     if not await run_in_threadpool(kept.is_member, who.site.engine, case, person):
         said = await who.site.hub.note(
             case, who.speaker.person, who.speaker.role.value, "invited", {"person": person},
