@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import secrets
 from dataclasses import dataclass
 from typing import Any
@@ -30,7 +31,9 @@ _GOOD_S = 300.0  #: how long a challenge waits
 _MOST = 20  #: passkeys of one person
 _WRONG = "this passkey does not fit, or it took too long; try again, or sign in by another way"
 _NAME = "Fringescope"
-_BROKEN = (WebAuthnException, ValueError, KeyError, TypeError, AttributeError)  # of answers that are no answers
+_ID = re.compile(r"[A-Za-z0-9_-]{1,1400}")
+#: of answers that are no answers
+_BROKEN = (WebAuthnException, ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,9 @@ class Passkeys:
     def check(self, credential: dict[str, Any]) -> str:
         """Who holds the key that signed. Raises SignInError, in the same words whatever is wrong."""
         challenge, asked = self._taken(credential)
-        k, key = db.passkeys, str(credential.get("id", ""))
+        k, key = db.passkeys, credential.get("id")
+        if not isinstance(key, str) or not _ID.fullmatch(key):
+            raise SignInError(_WRONG)
         with db.reading(self._engine) as c:
             row = c.execute(sa.select(k).where(k.c.id == key)).first()
         if row is None or asked is None or asked.person is not None:
