@@ -139,8 +139,7 @@ class OpenId:
         ways = about.get("token_endpoint_auth_methods_supported", ["client_secret_basic"])
         how: dict[str, Any] = {}
         if "client_secret_basic" in ways:
-            pair = f"{quote_plus(p.client)}:{quote_plus(p.secret)}"
-            how["headers"] = {"authorization": "Basic " + base64.b64encode(pair.encode()).decode()}
+            how["auth"] = httpx.BasicAuth(quote_plus(p.client), quote_plus(p.secret))
         else:
             form |= {"client_id": p.client, "client_secret": p.secret}
         token = self._ask("POST", str(about["token_endpoint"]), data=form, **how).get("id_token")

@@ -28,6 +28,7 @@ from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Rel
 router = APIRouter()
 _MESSAGE: TypeAdapter[Any] = TypeAdapter(FromClient)
 _PAGE = 500
+_LAST_WORD_S = 2.0  #: how long a browser has to hear why its connection is closed
 
 
 async def _enter(socket: WebSocket, case: str, what: str) -> Asking | None:
@@ -76,9 +77,10 @@ async def room(socket: WebSocket, case: str, since: int = 0) -> None:
         await _receive(socket, asking, case, listener)
     finally:
         site.rooms.leave(case, listener)
-        sender.cancel()
+        if listener.ended is None:
+            sender.cancel()
         with contextlib.suppress(asyncio.CancelledError, Exception):
-            await sender
+            await asyncio.wait_for(sender, _LAST_WORD_S)
 
 
 async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int) -> None:
