@@ -46,7 +46,7 @@ def cbor(value: Any) -> bytes:
 
 @dataclass
 class Authenticator:
-    """A device with one key. `counts`: whether it counts its signatures, as old ones do and synchronised ones do not."""
+    """A device with one key. `counts`: whether it counts its signatures, as old devices do."""
 
     origin: str
     counts: bool = True

@@ -81,7 +81,7 @@ class IdentityProvider:
         self._server.server_close()
         self._thread.join(5)
 
-    # ----------------------------------------------------------------------------------------------------------- its side
+    # -------------------------------------------------------------------------------------------------------- its side
 
     def get(self, path: str) -> tuple[int, dict[str, Any], str]:
         at, query = urlsplit(path).path, {k: v[0] for k, v in parse_qs(urlsplit(path).query).items()}
@@ -121,7 +121,7 @@ class IdentityProvider:
         }  # fmt: skip
         return 200, {"access_token": "x", "token_type": "Bearer", "id_token": self.token(self.bent(claims))}
 
-    # ------------------------------------------------------------------------------------------------------------- tokens
+    # ---------------------------------------------------------------------------------------------------------- tokens
 
     @staticmethod
     def public(key: rsa.RSAPrivateKey, kid: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import secrets
 import socket
@@ -13,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
+import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -22,7 +24,9 @@ from fringescope.server.running import Server
 from tests.server.conftest import PASSWORD, populate
 from tests.server.test_hub import scanned
 
-WIDE = Limits(logins_per_minute=100_000, requests_per_s=100_000, requests_burst=100_000, ops_per_s=1e5, ops_burst=10_000)
+WIDE = Limits(
+    logins_per_minute=100_000, requests_per_s=100_000, requests_burst=100_000, ops_per_s=1e5, ops_burst=10_000
+)
 ROLES = ("stranger", "guest", "watcher", "observer", "expert", "operator", "admin")
 S = 1_000_000_000
 
@@ -110,7 +114,9 @@ def cookies(client: Client) -> str:
 
 
 @contextmanager
-def room_of(client: Client, case: str, since: int = 10**6, ssl: Any = None, **headers: str) -> Iterator[ClientConnection]:
+def room_of(
+    client: Client, case: str, since: int = 10**6, ssl: Any = None, **headers: str
+) -> Iterator[ClientConnection]:
     """A raw connection to a room, from which the log up to now was not asked for."""
     named = {k.replace("_", "-"): v for k, v in headers.items()} | {"Cookie": cookies(client)}
     origin: Any = named.pop("Origin", None)
@@ -132,12 +138,10 @@ def heard(room: ClientConnection, *types: str, timeout_s: float = 10.0) -> dict[
 
 def closed(room: ClientConnection, timeout_s: float = 10.0) -> tuple[int, str]:
     """With what code and reason a connection is closed; what comes before is passed over."""
-    try:
-        while True:
-            room.recv(timeout_s)
-    except ConnectionClosed as e:
-        assert e.rcvd is not None, "closed without a word"
-        return e.rcvd.code, e.rcvd.reason
+    with pytest.raises(ConnectionClosed) as e:
+        all(room.recv(timeout_s) is not None for _ in itertools.count())
+    assert e.value.rcvd is not None, "closed without a word"
+    return e.value.rcvd.code, e.value.rcvd.reason
 
 
 def op(what: dict[str, Any]) -> dict[str, Any]:

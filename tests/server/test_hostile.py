@@ -86,7 +86,8 @@ def test_a_long_body_is_not_read(world: World) -> None:
 
 MESSAGES = {
     "deep": DEEP, "deep in a field": '{"type": "say", "op": ' + DEEP, "no JSON": "{", "nothing": "", "a list": "[]",
-    "no type": "{}", "a type that is none": '{"type": "welcome"}', "a number": "7", "a type that is a list": '{"type": []}',
+    "no type": "{}", "a type that is none": '{"type": "welcome"}', "a number": "7",
+    "a type that is a list": '{"type": []}',
     "half a letter": '{"type": "\\ud800"}', "a long number": '{"type": "ping", "at_ms": ' + "9" * 5000 + "}",
     "not a number": '{"type": "ping", "at_ms": NaN}', "endless": '{"type": "ping", "at_ms": 1e999}',
     "somebody else": '{"type": "pointer", "person": "person-0", "pixel": [1, 2]}',
@@ -160,7 +161,8 @@ def test_one_person_does_not_fill_a_room(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------------------- files
 
 NAMES = [
-    'a"; filename=evil.exe', "a\r\nset-cookie: fringescope=evil", "../../etc/passwd", "ünïcode\u202eexe.txt", "", "x/..",
+    'a"; filename=evil.exe', "a\r\nset-cookie: fringescope=evil", "../../etc/passwd", "ünïcode\u202eexe.txt", "",
+    "x/..",
 ]  # fmt: skip
 
 
@@ -195,7 +197,15 @@ def test_a_file_of_another_case_is_not_there(world: World) -> None:
         assert asked(world.client(role), "GET", path).status_code == 404  # the hash alone opens nothing
     for role in ("expert", "guest"):
         assert asked(world.client(role), "GET", f"/api/cases/{world.other.id}/files/{sha256}").status_code == 404
-    for odd in ("../" * 6 + "etc/passwd", "..%2f..%2fhub.sqlite", "%2e%2e", "0" * 63, "A" * 64, "0" * 64 + "%0a", "%00"):
+    for odd in (
+        "../" * 6 + "etc/passwd",
+        "..%2f..%2fhub.sqlite",
+        "%2e%2e",
+        "0" * 63,
+        "A" * 64,
+        "0" * 64 + "%0a",
+        "%00",
+    ):
         answer = asked(world.client("operator"), "GET", f"/api/cases/{world.case.id}/files/{odd}")
         assert answer.status_code in (404, 405, 422), (odd, answer.status_code)
     for odd in ("case-" + "0" * 20 + "%0a", "..%2f", "case-" + "0" * 19 + "%00"):

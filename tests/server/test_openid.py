@@ -41,7 +41,7 @@ def browser(hub: Server) -> httpx.Client:
     return httpx.Client(base_url=hub.url)
 
 
-def begun(hub: Server, by: httpx.Client) -> str:
+def begun(by: httpx.Client) -> str:
     """Where the provider's page is."""
     answer = by.get("/api/provider/begin")
     assert answer.status_code == 303, answer.text
@@ -51,7 +51,7 @@ def begun(hub: Server, by: httpx.Client) -> str:
     return answer.headers["location"]
 
 
-def back(hub: Server, by: httpx.Client, where: str) -> str:
+def back(hub: Server, where: str) -> str:
     """Through the provider's page, to where it sends the browser: path and query."""
     answer = httpx.get(where)
     assert answer.status_code == 302, answer.text
@@ -61,7 +61,7 @@ def back(hub: Server, by: httpx.Client, where: str) -> str:
 
 
 def come_in(hub: Server, by: httpx.Client) -> httpx.Response:
-    return by.get(back(hub, by, begun(hub, by)))
+    return by.get(back(hub, begun(by)))
 
 
 def test_somebody_of_the_provider_comes_in(hub: Server, provider: IdentityProvider) -> None:
@@ -186,47 +186,47 @@ def test_keys_that_changed_are_asked_for_anew(hub: Server, provider: IdentityPro
         assert come_in(hub, by).status_code == 303
 
 
-def test_an_answer_is_worth_something_to_who_began_alone(hub: Server, provider: IdentityProvider) -> None:
+def test_an_answer_is_worth_something_to_who_began_alone(hub: Server) -> None:
     with browser(hub) as victim, browser(hub) as thief:
-        path = back(hub, thief, begun(hub, thief))
+        path = back(hub, begun(thief))
         refused(hub, victim.get(path))  # signed in as the thief, without knowing (log-in CSRF)
         refused(hub, thief.get(path))  # and the state is used up
-        path = back(hub, victim, begun(hub, victim))
-        begun(hub, thief)
+        path = back(hub, begun(victim))
+        begun(thief)
         refused(hub, thief.get(path))  # a code that was overheard
-        where = begun(hub, victim)
-        query = parse_qs(urlsplit(back(hub, victim, where)).query)
+        where = begun(victim)
+        query = parse_qs(urlsplit(back(hub, where)).query)
         for state in ("", "x", query["state"][0] + "x", query["state"][0][:-1]):
             refused(hub, victim.get("/api/provider/callback?" + urlencode({"code": query["code"][0], "state": state})))
         own = parse_qs(urlsplit(where).query)["state"][0]
         mixed = {"code": query["code"][0], "state": own, "iss": "https://evil.example"}
         refused(hub, victim.get("/api/provider/callback?" + urlencode(mixed)))
         assert victim.get("/api/provider/callback?error=access_denied&state=" + own).status_code == 401
-        path = back(hub, victim, begun(hub, victim))
+        path = back(hub, begun(victim))
         assert victim.get(path).status_code == 303
         refused_again = victim.get(path)
         assert refused_again.status_code == 401
 
 
-def test_the_code_of_one_is_no_good_with_the_state_of_another(hub: Server, provider: IdentityProvider) -> None:
+def test_the_code_of_one_is_no_good_with_the_state_of_another(hub: Server) -> None:
     """PKCE: the provider gives a token for a code to who began with it alone."""
     with browser(hub) as one, browser(hub) as two:
-        mine = parse_qs(urlsplit(back(hub, one, begun(hub, one))).query)
-        theirs = parse_qs(urlsplit(back(hub, two, begun(hub, two))).query)
+        mine = parse_qs(urlsplit(back(hub, begun(one))).query)
+        theirs = parse_qs(urlsplit(back(hub, begun(two))).query)
         mixed = {"code": theirs["code"][0], "state": mine["state"][0]}
         answer = one.get("/api/provider/callback?" + urlencode(mixed))
         assert (answer.status_code, "said no" in answer.text) == (503, True)
         assert len(hub.site.accounts.people()) == 4
 
 
-def test_it_does_not_wait_for_ever(hub: Server, provider: IdentityProvider) -> None:
+def test_it_does_not_wait_for_ever(hub: Server) -> None:
     with browser(hub) as by:
-        path = back(hub, by, begun(hub, by))
+        path = back(hub, begun(by))
         later(hub, 601)
         refused(hub, by.get(path))
 
 
-def test_who_came_in_before_is_out_when_they_come_in_anew(hub: Server, provider: IdentityProvider) -> None:
+def test_who_came_in_before_is_out_when_they_come_in_anew(hub: Server) -> None:
     """No session outlives the next one of the same browser, and none is kept that somebody else chose (fixation)."""
     with browser(hub) as by:
         by.cookies.set("fringescope", "chosen-by-a-thief", domain="127.0.0.1")

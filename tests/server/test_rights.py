@@ -315,7 +315,7 @@ def refused_from_afar(client: Client, case: str, **headers: str) -> None:
         assert heard(room, "welcome")["local"] is False
         for kind in LOCAL:
             answer = say(room, {"kind": kind} | SAID[kind][1])
-            assert answer["refused"] == f"{kind} is for the operator at the instrument; from afar you can propose and stop"
+            assert answer["refused"].startswith(f"{kind} is for the operator at the instrument;")
         assert "at the instrument" not in say(room, {"kind": "stop"})["refused"]
     for kind in LOCAL:
         body = [op({"kind": kind} | SAID[kind][1])]

@@ -40,7 +40,7 @@ def search(
     member = None if s.role in (PersonRole.OPERATOR, PersonRole.ADMIN) and s.case is None else s.person
     total, found = kept.search(
         who.site.engine, q.replace("\x00", ""), status.value if status else None, limit, offset, member,
-        _sees_patients(who),
+        _sees_patients(who), s.case,
     )  # fmt: skip
     return CaseList(total=total, cases=found)
 
