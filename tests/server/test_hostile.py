@@ -18,6 +18,7 @@ from fringescope.server.config import Limits
 from fringescope.server.running import Server
 from tests.server.conftest import PASSWORD
 from tests.server.people_scenes import WIDE, World, asked, closed, cookies, heard, op, room_of, say, world_at
+from tests.server.test_hub import SCAN, stroke
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +144,25 @@ def test_a_flood_of_stops_fills_no_log_and_a_stop_that_matters_is_never_too_ofte
         answers = [say(room, {"kind": "stop"}) for _ in range(30)]
         assert sum("too many ops" in x.get("why", "") for x in answers) == 25
         assert len(world.case.events()) == before + 5
+        path, body = f"/api/cases/{world.case.id}/ops", [op({"kind": "stop"})]
+        assert asked(world.client("observer"), "POST", path, body).status_code == 429
         monkeypatch.setattr(world.hub.site.hub, "can_stop", lambda _case: True)
+        assert asked(world.client("observer"), "POST", path, body).status_code == 200
         assert say(room, {"kind": "stop"})["type"] == "said"
+
+
+def test_long_ops_count_as_many(tmp_path: Path) -> None:
+    few = replace(WIDE, ops_per_s=0.001, ops_burst=10)
+    with world_at(tmp_path, limits=few) as world, room_of(world.client("expert"), world.case.id) as room:
+        long = {"kind": "put", "stroke": stroke("s") | {"pixels": [[k / 7, k / 7] for k in range(5000)]}, "scan": SCAN}
+        size = len(json.dumps(long))
+        answers = [say(room, long) for _ in range(5)]
+        taken = sum(a.get("refused") == "" for a in answers)
+        assert taken == 10 // (1 + size // 50_000) < 5
+        path = f"/api/cases/{world.case.id}/ops"
+        assert asked(world.client("operator"), "POST", path, [op(long) for _ in range(5)]).status_code == 429
+        assert asked(world.client("observer"), "POST", path, [op({"kind": "stop"})] * 10).status_code == 200
+        assert asked(world.client("observer"), "POST", path, [op({"kind": "stop"})]).status_code == 429
 
 
 def test_one_person_does_not_fill_a_room(tmp_path: Path) -> None:

@@ -128,7 +128,9 @@ def test_wrong_codes_at_once_are_counted_each(world: World, monkeypatch: pytest.
 def test_who_was_revoked_does_not_come_in(world: World) -> None:
     made = world.case.invite("Dr. Gast")
     world.case.revoke(made.id)
+    before = world.hub.site.accounts.people()
     assert accepted(world, made.token, made.code).status_code == 401
+    assert world.hub.site.accounts.people() == before
 
 
 def test_a_revocation_while_somebody_comes_in(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

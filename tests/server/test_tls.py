@@ -78,6 +78,17 @@ def test_a_page_that_it_serves_itself_is_its_own(hub: Server) -> None:
                     assert closed(room)[0] == 4403
 
 
+def test_a_passkey_is_bound_to_a_page_that_was_named(hub: Server) -> None:
+    """A relay at another name can claim that name in Host and Origin; no key is ever made or asked for it."""
+    context = ssl.create_default_context(cafile=str(hub.config.certificate))
+    with httpx.Client(base_url=hub.url, verify=context) as http:
+        evil = f"relay.example:{hub.config.port}"
+        answer = http.post("/api/passkeys/ask", headers={"host": evil, "origin": f"https://{evil}"})
+        assert (answer.status_code, "--origin" in answer.text) == (409, True)
+        mine = http.post("/api/passkeys/ask", headers={"origin": f"https://localhost:{hub.config.port}"})
+        assert mine.json()["options"]["rpId"] == "localhost"
+
+
 def test_the_certificate_is_for_this_machine_and_kept(tmp_path: Path) -> None:
     certificate, key = running.self_signed(tmp_path / "tls", "192.0.2.7")
     made = x509.load_pem_x509_certificate(certificate.read_bytes())

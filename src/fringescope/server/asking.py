@@ -18,6 +18,7 @@ from fringescope.server.site import Site
 from fringescope.wire import PersonRole, Problem
 
 CaseId = Annotated[str, Path(pattern=r"^case-[0-9a-f]{20}$", description="Identifier of a case.")]
+_LONG_OP = 50_000  #: bytes of an op that counts as two
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
 
@@ -88,6 +89,11 @@ def may_see(site: Site, speaker: Speaker, case: str) -> bool:
     if speaker.case is None and speaker.role in (PersonRole.OPERATOR, PersonRole.ADMIN):
         return cases.get(site.engine, case) is not None
     return cases.is_member(site.engine, case, speaker.person)
+
+
+def size_of(length: int) -> int:
+    """As how many ops one of so many bytes counts: long ones fill a disk sooner."""
+    return 1 + length // _LONG_OP
 
 
 def still(asking: Asking, case: str) -> bool:

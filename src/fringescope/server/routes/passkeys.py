@@ -20,8 +20,14 @@ KeyId = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{1,1400}$", description="Ide
 
 
 def _origin(request: Request, site: Site) -> str:
-    """The page that asks, which is one of ours (see `security`); a program without a page stands for the first."""
-    return request.headers.get("origin") or site.config.origin
+    """The page that asks, which must be one that whoever runs the hub has named: a key is bound to it for good.
+
+    A program without a page stands for the first of them.
+    """
+    origin = request.headers.get("origin", site.config.origin)
+    if origin not in (site.config.origin, *site.config.own_origins):
+        raise HTTPException(409, f"passkeys need to know their page; start the hub with --origin {origin[:200]}")
+    return origin
 
 
 def _may(who: Who) -> None:
@@ -43,7 +49,7 @@ def mine(who: Who) -> list[Passkey]:
     return who.site.passkeys.of(who.session.person.id)
 
 
-@router.post("/new", responses=problems(401, 403))
+@router.post("/new", responses=problems(401, 403, 409))
 def offer(who: Who, request: Request) -> KeyOptions:
     """What the browser needs to make a passkey."""
     _may(who)
@@ -71,7 +77,7 @@ def remove(key: KeyId, who: Who) -> Ended:
     return Ended()
 
 
-@router.post("/ask", responses=problems())
+@router.post("/ask", responses=problems(409))
 def ask(request: Request, site: Parts) -> KeyOptions:
     """What the browser needs to sign in by a passkey, or to confirm who you are."""
     not_too_often(request, site)

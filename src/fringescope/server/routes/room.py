@@ -17,7 +17,7 @@ from fringescope.errors import DeviceError, FringescopeError
 from fringescope.server import database as db
 from fringescope.server import journal, truth
 from fringescope.server.accounts import SignInError
-from fringescope.server.asking import Asking, asking_of, may_see, still
+from fringescope.server.asking import Asking, asking_of, may_see, size_of, still
 from fringescope.server.hub import as_event
 from fringescope.server.rights import refusal
 from fringescope.server.rooms import EXPELLED, FLOOD, Listener
@@ -143,7 +143,7 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             if isinstance(said, Ping):
                 listener.send(Pong(at_ms=said.at_ms).model_dump_json())
             elif isinstance(said, Say):
-                await _say(asking, case, listener, said, waiting)
+                await _say(asking, case, listener, said, waiting, size_of(len(text)))
             elif (why := refusal(asking.speaker, said.type)) or not live.take():
                 if why:
                     listener.send(_refused(why))
@@ -155,10 +155,12 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
                 await task
 
 
-async def _say(asking: Asking, case: str, listener: Listener, said: Say, waiting: set[asyncio.Task[None]]) -> None:
+async def _say(
+    asking: Asking, case: str, listener: Listener, said: Say, waiting: set[asyncio.Task[None]], size: int
+) -> None:
     """An op on its way to the log; a stop of something that is armed or lit is never too often."""
     what = said.op.what.kind
-    if not (what == "stop" and asking.site.hub.can_stop(case)) and asking.site.ops.take(asking.speaker.person):
+    if not (what == "stop" and asking.site.hub.can_stop(case)) and asking.site.ops.take(asking.speaker.person, size):
         listener.send(_refused(f"op {said.op.number}: too many ops; wait a moment and say it again"))
         return
     if what == "carry_over":
