@@ -23,6 +23,7 @@ from fringescope.wire import Person, PersonRole
 S = 1_000_000_000
 SHORTEST = 12  #: letters of a password at least
 LONGEST = 200  #: letters of a name at most
+_AT_ONCE = 4  #: passwords judged at once: each takes 64 MiB meanwhile
 
 
 class SignInError(FringescopeError):
@@ -68,6 +69,7 @@ class Accounts:
         self._engine, self._clock, self._limits = engine, clock, limits
         self._hasher = hasher or argon2.PasswordHasher()
         self._lock, self._changing = threading.Lock(), threading.Lock()
+        self._few = threading.BoundedSemaphore(_AT_ONCE)
         self._lockout = Lockout(clock, limits.failures, limits.locked_s)
         self._roster: dict[str, tuple[Person, str | None, int | None]] = {}
         self.gone: Callable[[str], None] = lambda _person: None
@@ -284,7 +286,8 @@ class Accounts:
 
     def _fits(self, hashed: str, password: str) -> bool:
         try:
-            return self._hasher.verify(hashed, password)
+            with self._few:
+                return self._hasher.verify(hashed, password)
         except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
             return False
 
