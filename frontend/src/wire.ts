@@ -194,6 +194,17 @@ export interface Job {
 /** How far a job is. */
 export type JobState = "waiting" | "running" | "done" | "failed" | "cancelled";
 
+/** What navigator.credentials gave back (PublicKeyCredential.toJSON()); a name for the key where it is new. */
+export interface KeyAnswer {
+  credential: Record<string, unknown>;
+  label?: string;
+}
+
+/** What a page hands to navigator.credentials.create or .get, as `publicKey`; good once, and not for long. */
+export interface KeyOptions {
+  options: Record<string, unknown>;
+}
+
 /** A layer is made, renamed or hidden for everybody, by its author. */
 export interface Layer {
   kind: "layer";
@@ -222,11 +233,12 @@ export interface NewInvitation {
   hours?: number;
 }
 
-/** An account to make. */
+/** An account to make: of who signs in by a password, by the identity provider (`subject`: who they are there). */
 export interface NewPerson {
   name: string;
-  password: string;
+  password?: string | null;
   role: PersonRole;
+  subject?: string | null;
 }
 
 /** A pose of the calibration board; the first of a session says which board it is, as its board.json does. */
@@ -245,6 +257,13 @@ export interface Op {
   number: number;
   at_ns?: number;
   what: Put | Remove | Layer | Comment | Withdraw | Undo | Submit | Sign | Preview | Arm | Start | Acknowledge | Stop | CarryOver;
+}
+
+/** A passkey of somebody: its public half is all that the hub has. */
+export interface Passkey {
+  id: string;
+  label: string;
+  created_ns: number;
 }
 
 /** The old password, and the new one. */
@@ -467,6 +486,13 @@ export interface View {
 export interface Warned {
   type: "warned";
   text: string;
+}
+
+/** How one may sign in here; `provider` is the page to open for the identity provider, None without one. */
+export interface Ways {
+  passwords?: boolean;
+  passkeys?: boolean;
+  provider?: string | null;
 }
 
 /** The first message: who you are here, how far the log goes, who is in the room. */

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -56,27 +57,51 @@ def serve(
     behind_proxy: Annotated[
         bool, typer.Option("--behind-proxy", help="Another server hands requests on: nobody is local by address.")
     ] = False,
+    oidc_issuer: Annotated[
+        str | None, typer.Option(metavar="URL", help="An identity provider (OpenID Connect) whose people may come in.")
+    ] = None,
+    oidc_client: Annotated[str, typer.Option(help="What this hub is called there.")] = "",
+    oidc_secret: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its secret there; else FRINGESCOPE_OIDC_SECRET.")
+    ] = None,
+    oidc_role_claim: Annotated[str | None, typer.Option(help="The claim that names the role, as roles.")] = None,
+    oidc_role: Annotated[str | None, typer.Option(help="The role of people without one in the claim.")] = None,
+    oidc_admit: Annotated[bool, typer.Option("--oidc-admit", help="Whom nobody knows gets an account.")] = False,
     settings: SettingsFile = None,
     set_: SetOption = None,
 ) -> None:
     """The hub: cases, shared drawing, and the instrument, for the operator here and experts anywhere."""
     _needs_extra()
     from fringescope.server import running
-    from fringescope.server.config import Config
+    from fringescope.server.config import Config, Provider
 
     if self_signed:
         if certificate or key:
             raise UsageError("--self-signed makes a certificate; leave --certificate and --key away")
         certificate, key = running.self_signed(data / "tls", host)
+    provider = None
+    if oidc_issuer is not None:
+        secret = _secret(oidc_secret)
+        provider = Provider(oidc_issuer, oidc_client, secret, oidc_role_claim, oidc_role, oidc_admit)
     config = Config(
         data, host, port, database, device, rig, certificate, key, tuple(origin or ()), behind_proxy,
-        load_settings(settings, set_),
+        load_settings(settings, set_), provider=provider,
     )  # fmt: skip
     server = running.Server(config)
     server.check()
     running.first_admin(server.site, say)
     say(f"research use only; the hub listens at {server.url} (data in {data}); Ctrl-C ends it")
     server.run()
+
+
+def _secret(file: Path | None) -> str:
+    """The secret of the hub at its identity provider: never an argument, which everybody on the machine could read."""
+    if file is None:
+        return os.environ.get("FRINGESCOPE_OIDC_SECRET", "")
+    try:
+        return file.read_text().strip()
+    except (OSError, UnicodeDecodeError) as e:
+        raise UsageError(f"--oidc-secret {file}: {getattr(e, 'strerror', None) or e}; needed a text file") from None
 
 
 def _config(data: Path, database: str | None) -> Config:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -42,8 +43,9 @@ class Client:
         timeout_s: float = 30.0,
         http: httpx.Client | None = None,
     ) -> None:
-        self.url, self.verify = url.rstrip("/"), verify
-        self.http = http or httpx.Client(base_url=self.url, verify=verify, timeout=timeout_s)
+        self.url = url.rstrip("/")
+        self.verify: bool | ssl.SSLContext = verify if isinstance(verify, bool) else _trusting(verify)
+        self.http = http or httpx.Client(base_url=self.url, verify=self.verify, timeout=timeout_s)
         self.account: Account | None = None
         if name is not None:
             self.sign_in(name, password or "")
@@ -176,6 +178,14 @@ class Client:
         if job.state is not JobState.DONE:
             raise HubError(f"{job.kind}: {job.why}")
         return job
+
+
+def _trusting(certificate: str) -> ssl.SSLContext:
+    """TLS that believes one certificate. Raises HubError for a file that holds none."""
+    try:
+        return ssl.create_default_context(cafile=certificate)
+    except OSError as e:  # an SSLError is one, too
+        raise HubError(f"{certificate}: {e.strerror or e}; needed a certificate (PEM) of the hub") from e
 
 
 class HubCase:

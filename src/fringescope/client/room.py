@@ -117,7 +117,7 @@ class Room:
         import ssl
 
         verify = self.case.hub.verify
-        context = ssl.create_default_context(cafile=verify if isinstance(verify, str) else None)
+        context = verify if isinstance(verify, ssl.SSLContext) else ssl.create_default_context()
         if verify is False:
             context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
         return context

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import threading
+import unicodedata
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,10 +17,13 @@ from fringescope.errors import FringescopeError, UsageError
 from fringescope.server import database as db
 from fringescope.server.clock import Clock
 from fringescope.server.config import Limits
+from fringescope.server.lockout import Lockout
 from fringescope.wire import Person, PersonRole
 
 S = 1_000_000_000
 SHORTEST = 12  #: letters of a password at least
+LONGEST = 200  #: letters of a name at most
+_AT_ONCE = 4  #: passwords judged at once: each takes 64 MiB meanwhile
 
 
 class SignInError(FringescopeError):
@@ -42,6 +46,14 @@ def new_id(kind: str) -> str:
     return f"{kind}-{secrets.token_hex(10)}"
 
 
+def plain_name(name: str) -> str:
+    """A name in its one form. Raises UsageError for letters that nobody sees: they make one name look like another."""
+    made = " ".join(unicodedata.normalize("NFKC", name).split())
+    if not made or len(made) > LONGEST or any(unicodedata.category(c)[0] == "C" for c in made):
+        raise UsageError(f"the name {made[:40]!r}; needed 1 to {LONGEST} letters that can be seen")
+    return made
+
+
 def digest(secret: str) -> str:
     """What is kept of a cookie or a link: it opens nothing."""
     return hashlib.sha256(secret.encode()).hexdigest()
@@ -56,7 +68,9 @@ class Accounts:
     def __init__(self, engine: sa.Engine, clock: Clock, limits: Limits, hasher: argon2.PasswordHasher | None = None):
         self._engine, self._clock, self._limits = engine, clock, limits
         self._hasher = hasher or argon2.PasswordHasher()
-        self._lock = threading.Lock()
+        self._lock, self._changing = threading.Lock(), threading.Lock()
+        self._few = threading.BoundedSemaphore(_AT_ONCE)
+        self._lockout = Lockout(clock, limits.failures, limits.locked_s)
         self._roster: dict[str, tuple[Person, str | None, int | None]] = {}
         self.gone: Callable[[str], None] = lambda _person: None
         self._nobody = self._hasher.hash(secrets.token_hex(16))  # so that an unknown name takes as long as a known one
@@ -79,6 +93,11 @@ class Accounts:
         known = self._roster.get(person)
         return known[0] if known else None
 
+    def case_of(self, person: str) -> str | None:
+        """The one case that somebody was invited to; None for who has an account of their own."""
+        known = self._roster.get(person)
+        return known[1] if known else None
+
     def allowed(self, person: str) -> bool:
         """Whether somebody still may come in: asked for each message."""
         known = self._roster.get(person)
@@ -89,7 +108,7 @@ class Accounts:
         expires_ns: int | None = None, subject: str | None = None,
     ) -> Person:  # fmt: skip
         """A new account; without a password one enters by another way. Raises UsageError for a name that is taken."""
-        hashed = self._hashed(password) if password is not None else ""
+        name, hashed = plain_name(name), self._hashed(password) if password is not None else ""
         row = {
             "id": new_id("person"), "name": name, "role": role.value, "password": hashed, "disabled": False,
             "failures": 0, "locked_ns": 0, "created_ns": self._clock.now_ns(), "case_id": case,
@@ -101,38 +120,48 @@ class Accounts:
                 if case is not None:
                     c.execute(db.members.insert().values(case_id=case, person_id=row["id"]))
         except sa.exc.IntegrityError:
-            raise UsageError(f"there is an account of the name {name!r} already; choose another name") from None
+            taken = "this person of the identity provider has an account already"
+            if subject is None or self.by_subject(subject) is None:
+                taken = f"there is an account of the name {name!r} already; choose another name"
+            raise UsageError(taken) from None
         return self._renew(str(row["id"]))
 
     def change(
         self, person: str, *, name: str | None = None, password: str | None = None, role: PersonRole | None = None,
-        disabled: bool | None = None,
+        disabled: bool | None = None, keep_keys: bool = False,
     ) -> Person:  # fmt: skip
-        """Changes an account; what somebody has open is closed where they lose a right. Raises UsageError."""
-        before = self.person(person)
-        if before is None:
-            raise UsageError(f"nobody has the account {person}")
-        ends = bool(disabled) or (role is not None and role is not before.role)
-        if ends and before.role is PersonRole.ADMIN and self._admins() == {person}:
-            raise UsageError("the last administrator cannot be disabled or become something else; name another first")
-        values: dict[str, Any] = {"failures": 0, "locked_ns": 0}
-        if name is not None:
-            values["name"] = name
-        if password is not None:
-            values["password"] = self._hashed(password)
-        if role is not None:
-            values["role"] = role.value
-        if disabled is not None:
-            values["disabled"] = disabled
-        try:
-            with db.writing(self._engine) as c:
-                c.execute(db.people.update().where(db.people.c.id == person).values(values))
-                if ends or password is not None:
-                    c.execute(db.sessions.delete().where(db.sessions.c.person_id == person))
-        except sa.exc.IntegrityError:
-            raise UsageError(f"there is an account of the name {name!r} already; choose another name") from None
-        after = self._renew(person)
-        if ends or password is not None:
+        """Changes an account; what somebody has open is closed where they lose a right. Raises UsageError.
+
+        A new password takes passkeys away with it unless `keep_keys`: who sets one for somebody else wants nobody in
+        who was in before.
+        """
+        name = None if name is None else plain_name(name)
+        hashed = None if password is None else self._hashed(password)
+        with self._changing:  # one after the other: two administrators cannot both be the last but one
+            before = self.person(person)
+            if before is None:
+                raise UsageError(f"nobody has the account {person}")
+            ends = bool(disabled) or (role is not None and role is not before.role)
+            if ends and before.role is PersonRole.ADMIN and self._admins() == {person}:
+                raise UsageError("the last administrator cannot be disabled or become something else; name another")
+            if role in (PersonRole.OPERATOR, PersonRole.ADMIN) and self.case_of(person) is not None:
+                raise UsageError(f"a guest of one case cannot be {role}; make an account for them")
+            wanted = {"name": name, "password": hashed, "role": role and role.value, "disabled": disabled}
+            values = {"failures": 0, "locked_ns": 0} | {k: v for k, v in wanted.items() if v is not None}
+            try:
+                with db.writing(self._engine) as c:
+                    c.execute(db.people.update().where(db.people.c.id == person).values(values))
+                    if ends or hashed is not None:
+                        c.execute(db.sessions.delete().where(db.sessions.c.person_id == person))
+                    if hashed is not None and not keep_keys:
+                        c.execute(db.passkeys.delete().where(db.passkeys.c.person_id == person))
+            except sa.exc.IntegrityError:
+                raise UsageError(f"there is an account of the name {name!r} already; choose another name") from None
+            after = self._renew(person)
+        if hashed is not None or disabled is False:
+            self._lockout.forget(before.name)
+            self._lockout.forget(after.name)
+        if ends or hashed is not None:
             self.gone(person)
         return after
 
@@ -144,71 +173,103 @@ class Accounts:
 
     # ------------------------------------------------------------------------------------------------------ signing in
 
-    def sign_in(self, name: str, password: str) -> tuple[str, Session]:
-        """A new session: the secret for the cookie, and what it stands for.
+    def check(self, name: str, password: str, address: str = "") -> str:
+        """Whose name and password these are, tried from an address; their identifier.
 
-        Raises SignInError: the same words for an unknown name, a wrong password and an account that is locked.
+        Raises SignInError: the same words, after the same work, for an unknown name, a wrong password, an account that
+        is disabled or was tried too often.
         """
-        now = self._clock.now_ns()
+        try:
+            name = plain_name(name)
+        except UsageError:
+            name = ""
+        free = self._lockout.begin(name, address)
         with db.reading(self._engine) as c:
             row = c.execute(sa.select(db.people).where(db.people.c.name == name)).first()
         right = self._fits(row.password if row and row.password else self._nobody, password)
-        if row is None or not row.password or row.disabled or row.locked_ns > now:
-            right = False
-        if row is not None and row.locked_ns <= now and not right:
-            failures = row.failures + 1
-            locked = now + int(self._limits.locked_s * S) if failures >= self._limits.failures else 0
-            with db.writing(self._engine) as c:
-                values = {"failures": 0 if locked else failures, "locked_ns": locked}
-                c.execute(db.people.update().where(db.people.c.id == row.id).values(values))
-        if not right or row is None or not self.allowed(row.id):
+        if not free or not right or row is None or not row.password or not self.allowed(row.id):
             raise SignInError(
                 f"name and password do not fit, or the account is locked; after {self._limits.failures} wrong "
                 f"passwords it stays locked for {self._limits.locked_s / 60:.0f} minutes"
             )
-        if row.failures or self._hasher.check_needs_rehash(row.password):
-            again = self._hasher.check_needs_rehash(row.password)
-            values = {"failures": 0, **({"password": self._hasher.hash(password)} if again else {})}
+        self._lockout.right(name, address)
+        if self._hasher.check_needs_rehash(row.password):
+            values = {"password": self._hasher.hash(password)}
             with db.writing(self._engine) as c:
                 c.execute(db.people.update().where(db.people.c.id == row.id).values(values))
-        return self.open_session(row.id)
+        return str(row.id)
 
-    def open_session(self, person: str) -> tuple[str, Session]:
-        """A session for somebody who has proved who they are. Raises SignInError if they may not come in."""
+    def sign_in(self, name: str, password: str, address: str = "") -> tuple[str, Session]:
+        """A new session: the secret for the cookie, and what it stands for. Raises SignInError as `check` does."""
+        return self.open_session(self.check(name, password, address))
+
+    def open_session(self, person: str, confirmed: bool = True) -> tuple[str, Session]:
+        """A session for somebody who has proved who they are, just now if `confirmed`.
+
+        Raises SignInError if they may not come in.
+        """
         if not self.allowed(person):
             raise SignInError("this account is disabled or has expired; ask whoever made it")
         secret, now = secrets.token_urlsafe(32), self._clock.now_ns()
         row = {
             "digest": digest(secret), "person_id": person, "csrf": secrets.token_urlsafe(24), "created_ns": now,
-            "seen_ns": now, "confirmed_ns": now,
+            "seen_ns": now, "confirmed_ns": now if confirmed else 0,
         }  # fmt: skip
+        limits = self._limits
+        s = db.sessions.c
+        over = (s.created_ns < now - int(limits.session_s * S)) | (s.seen_ns < now - int(limits.idle_s * S))
         with db.writing(self._engine) as c:
-            c.execute(db.sessions.delete().where(db.sessions.c.created_ns < now - int(self._limits.session_s * S)))
+            c.execute(db.sessions.delete().where(over))
             c.execute(db.sessions.insert().values(row))
         return secret, self.session(secret)
 
     def session(self, secret: str) -> Session:
         """Who a cookie stands for. Raises SignInError."""
+        found, idle_ns = self._session(digest(secret))
+        if idle_ns > 60 * S:
+            with db.writing(self._engine) as c:
+                row = db.sessions.c.digest == found.digest
+                c.execute(db.sessions.update().where(row).values(seen_ns=self._clock.now_ns()))
+        return found
+
+    def session_of(self, session: str) -> Session:
+        """A session by its digest, as it stands; looking is no use of it. Raises SignInError where it has ended."""
+        return self._session(session)[0]
+
+    def _session(self, session: str) -> tuple[Session, int]:
         now = self._clock.now_ns()
         with db.reading(self._engine) as c:
-            row = c.execute(sa.select(db.sessions).where(db.sessions.c.digest == digest(secret))).first()
+            row = c.execute(sa.select(db.sessions).where(db.sessions.c.digest == session)).first()
         old = row is None or row.created_ns < now - self._limits.session_s * S
         if row is None or old or row.seen_ns < now - self._limits.idle_s * S or not self.allowed(row.person_id):
             raise SignInError("you are not signed in, or not any more; sign in")
-        if row.seen_ns < now - 60 * S:
-            with db.writing(self._engine) as c:
-                c.execute(db.sessions.update().where(db.sessions.c.digest == row.digest).values(seen_ns=now))
         person, case, _ = self._roster[row.person_id]
-        return Session(row.digest, person, row.csrf, row.confirmed_ns, case)
+        return Session(row.digest, person, row.csrf, row.confirmed_ns, case), now - row.seen_ns
+
+    def ended(self, seen: dict[str, bool]) -> set[str]:
+        """Which sessions (by digest) are over; those marked True were used just now and go on."""
+        now, s = self._clock.now_ns(), db.sessions.c
+        alive = s.seen_ns >= now - int(self._limits.idle_s * S)
+        young = s.created_ns >= now - int(self._limits.session_s * S)
+        if used := [d for d, active in seen.items() if active]:
+            with db.writing(self._engine) as c:
+                c.execute(db.sessions.update().where(s.digest.in_(used), alive).values(seen_ns=now))
+        with db.reading(self._engine) as c:
+            found = {r.digest for r in c.execute(sa.select(s.digest).where(s.digest.in_(list(seen)), young, alive))}
+        return set(seen) - found
 
     def sign_out(self, session: Session) -> None:
         """Ends a session."""
         with db.writing(self._engine) as c:
             c.execute(db.sessions.delete().where(db.sessions.c.digest == session.digest))
 
-    def confirm(self, session: Session, password: str) -> None:
+    def confirm(self, session: Session, password: str, address: str = "") -> None:
         """The person of a session proves once more who they are. Raises SignInError."""
-        self.sign_out(self.sign_in(session.person.name, password)[1])
+        self.check(session.person.name, password, address)
+        self.confirmed(session)
+
+    def confirmed(self, session: Session) -> None:
+        """The person of a session has proved once more who they are."""
         with db.writing(self._engine) as c:
             row = db.sessions.c.digest == session.digest
             c.execute(db.sessions.update().where(row).values(confirmed_ns=self._clock.now_ns()))
@@ -225,7 +286,8 @@ class Accounts:
 
     def _fits(self, hashed: str, password: str) -> bool:
         try:
-            return self._hasher.verify(hashed, password)
+            with self._few:
+                return self._hasher.verify(hashed, password)
         except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
             return False
 

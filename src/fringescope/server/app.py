@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -9,14 +11,15 @@ import argon2
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException as RawHTTPException
 
 from fringescope import __version__
 from fringescope.errors import FringescopeError, OutputError
 from fringescope.server.config import Config
-from fringescope.server.routes import audit, cases, people, room, scans, signing
+from fringescope.server.routes import audit, cases, passkeys, people, room, scans, signing
 from fringescope.server.security import Guarded
-from fringescope.server.site import open_site
+from fringescope.server.site import Site, open_site
 
 
 def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> FastAPI:
@@ -27,9 +30,11 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
     async def life(_app: FastAPI) -> AsyncIterator[None]:
         await site.hub.start()
         await site.instrument.start()
+        doors = asyncio.create_task(_watch_doors(site), name="doors")
         try:
             yield
         finally:
+            doors.cancel()
             site.rooms.end()
             await site.jobs.stop()
             await site.hub.stop()
@@ -46,11 +51,21 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         openapi_url="/openapi.json",
     )
     app.state.site = site
-    for part in (signing, people, cases, scans, audit, room):
+    for part in (signing, passkeys, people, cases, scans, audit, room):
         app.include_router(part.router)
     _explain(app)
     app.add_middleware(Guarded, config=config, requests=site.requests)
     return app
+
+
+async def _watch_doors(site: Site) -> None:
+    """A session that has expired is over in open rooms, too."""
+    while True:
+        await asyncio.sleep(site.config.limits.doors_s)
+        seen = site.rooms.sessions()
+        if seen:
+            with contextlib.suppress(FringescopeError):
+                site.rooms.end_sessions(await run_in_threadpool(site.accounts.ended, seen))
 
 
 def _explain(app: FastAPI) -> None:
@@ -67,7 +82,8 @@ def _explain(app: FastAPI) -> None:
         for one in e.errors()[:5]:
             where = ".".join(str(x) for x in one["loc"][1:]) or str(one["loc"][0])
             said.append(f"{where}: {one['msg']}")
-        return JSONResponse({"detail": "; ".join(said)[:1000]}, 422)
+        told = "; ".join(said)[:1000].encode(errors="replace").decode()  # a key may hold half a letter
+        return JSONResponse({"detail": told}, 422)
 
     @app.exception_handler(OutputError)
     async def unwritten(_request: Request, e: OutputError) -> JSONResponse:

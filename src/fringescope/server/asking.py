@@ -6,22 +6,37 @@ import hmac
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import Depends, HTTPException, Path, Request, WebSocket
+from fastapi import Depends, HTTPException, Path, Request
+from starlette.requests import HTTPConnection
 
 from fringescope.server import cases
 from fringescope.server.accounts import Session, SignInError
+from fringescope.server.config import Config
 from fringescope.server.rights import Speaker, refusal
 from fringescope.server.security import is_local
 from fringescope.server.site import Site
 from fringescope.wire import PersonRole, Problem
 
 CaseId = Annotated[str, Path(pattern=r"^case-[0-9a-f]{20}$", description="Identifier of a case.")]
+_LONG_OP = 50_000  #: bytes of an op that counts as two
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
 
 def cookie_of(tls: bool) -> str:
     """The name of the session's cookie: with TLS browsers refuse it from anywhere else."""
     return "__Host-fringescope" if tls else "fringescope"
+
+
+def is_secure(request: HTTPConnection, config: Config) -> bool:
+    """Whether the browser speaks https: with the hub, or with the proxy before it."""
+    said = request.headers.get("x-forwarded-proto", "").rsplit(",", 1)[-1].strip()
+    return config.tls or (config.behind_proxy and said == "https")
+
+
+def secret_of(request: HTTPConnection, config: Config) -> str:
+    """The secret of a session's cookie; with TLS that of the one name that nobody else could set."""
+    secure = request.cookies.get(cookie_of(True), "")
+    return secure if secure or config.tls else request.cookies.get(cookie_of(False), "")
 
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
@@ -69,18 +84,31 @@ class Asking:
 
 def may_see(site: Site, speaker: Speaker, case: str) -> bool:
     """Operators see all cases, guests the one that they were invited to, others those that they are members of."""
-    if speaker.case is not None:
-        return speaker.case == case
-    if speaker.role in (PersonRole.OPERATOR, PersonRole.ADMIN):
+    if speaker.case is not None and speaker.case != case:
+        return False
+    if speaker.case is None and speaker.role in (PersonRole.OPERATOR, PersonRole.ADMIN):
         return cases.get(site.engine, case) is not None
     return cases.is_member(site.engine, case, speaker.person)
 
 
-def asking_of(request: Request | WebSocket) -> Asking:
+def size_of(length: int) -> int:
+    """As how many ops one of so many bytes counts: long ones fill a disk sooner."""
+    return 1 + length // _LONG_OP
+
+
+def still(asking: Asking, case: str) -> bool:
+    """Whether somebody who came in is still signed in, as who they were, and may still see a case."""
+    try:
+        now = asking.site.accounts.session_of(asking.session.digest)
+    except SignInError:
+        return False
+    return now.person.role is asking.speaker.role and may_see(asking.site, asking.speaker, case)
+
+
+def asking_of(request: HTTPConnection) -> Asking:
     """Who a cookie stands for. Raises SignInError."""
     site: Site = request.app.state.site
-    secret = request.cookies.get(cookie_of(site.config.tls), "")
-    session = site.accounts.session(secret)
+    session = site.accounts.session(secret_of(request, site.config))
     p = session.person
     local = is_local(request.scope, site.config)
     return Asking(site, session, Speaker(p.id, p.role, local, session.case, session.confirmed_ns))

@@ -76,9 +76,13 @@ def get(engine: sa.Engine, case: str, with_patient: bool = False) -> Case | None
 
 
 def search(
-    engine: sa.Engine, words: str, status: str | None, limit: int, offset: int, member: str | None, patients: bool
+    engine: sa.Engine, words: str, status: str | None, limit: int, offset: int, member: str | None, patients: bool,
+    only: str | None = None,
 ) -> tuple[int, list[Case]]:
-    """Cases whose accession number, specimen or (for who may see it) patient holds all the words, the latest first."""
+    """Cases whose accession number, specimen or (for who may see it) patient holds all the words, the latest first.
+
+    `member`: those that this person was let into; `only`: the one that a guest was invited to.
+    """
     where: list[Any] = []
     text = sa.cast(db.cases.c.specimen, sa.Text)
     for word in words.split()[:10]:
@@ -92,6 +96,8 @@ def search(
         where.append(db.cases.c.status == status)
     if member is not None:
         where.append(db.cases.c.id.in_(sa.select(db.members.c.case_id).where(db.members.c.person_id == member)))
+    if only is not None:
+        where.append(db.cases.c.id == only)
     with db.reading(engine) as c:
         total = c.execute(sa.select(sa.func.count()).select_from(db.cases).where(*where)).scalar() or 0
         asked = _select().where(*where).order_by(db.cases.c.changed_ns.desc(), db.cases.c.id)

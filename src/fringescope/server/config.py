@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from fringescope.errors import UsageError
 from fringescope.settings import Settings
@@ -28,9 +29,43 @@ class Limits:
     locked_s: float = 300.0  #: for so long
     session_s: float = 12 * 3600.0  #: a session ends after
     idle_s: float = 3600.0  #: or after so long without a request
+    doors_s: float = 5.0  #: open rooms are looked through so often for sessions that are over
+    messages_per_s: float = 600.0  #: messages of any kind of one connection, before it is closed
+    messages_burst: int = 4000
     waiting: int = 4000  #: messages that wait for a browser that does not read before it is let go
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
+
+
+@dataclass(frozen=True)
+class Provider:
+    """An identity provider (OpenID Connect) whose people may come in. Raises UsageError where something is missing.
+
+    `role_claim` names the claim whose value is the role (a word of ours, or a list of which the first of ours counts);
+    `role` is that of people without one, None: they stay out. `admit`: whether unknown people get an account.
+    """
+
+    issuer: str
+    client: str
+    secret: str = field(repr=False)
+    role_claim: str | None = None
+    role: str | None = None
+    admit: bool = False
+    scope: str = "openid profile"
+
+    def __post_init__(self) -> None:
+        parts = urlsplit(self.issuer)
+        near = parts.scheme == "http" and parts.hostname in LOOPBACK
+        if parts.scheme != "https" and not near:
+            raise UsageError(f"--oidc-issuer {self.issuer}; needed an address that begins with https://")
+        if not self.client or not self.secret:
+            raise UsageError(
+                "--oidc-issuer needs --oidc-client and its secret: --oidc-secret FILE, or FRINGESCOPE_OIDC_SECRET"
+            )
+        if self.role not in (None, "operator", "expert", "observer"):
+            raise UsageError(f"--oidc-role {self.role}; needed operator, expert or observer")
+        if self.admit and self.role is None and self.role_claim is None:
+            raise UsageError("--oidc-admit needs --oidc-role or --oidc-role-claim: what new people may do")
 
 
 @dataclass(frozen=True)
@@ -52,8 +87,11 @@ class Config:
     behind_proxy: bool = False  #: another server hands requests on: nobody is local by their address alone
     settings: Settings = field(default_factory=Settings)
     limits: Limits = Limits()
+    provider: Provider | None = None
 
     def __post_init__(self) -> None:
+        if self.provider is not None and self.host not in LOOPBACK and not self.origins:
+            raise UsageError("--oidc-issuer needs --origin: where the provider sends people back to")
         if (self.certificate is None) != (self.key is None):
             raise UsageError("--certificate and --key belong together; give both, or --self-signed")
         if self.host not in LOOPBACK and self.certificate is None:
@@ -71,6 +109,11 @@ class Config:
     def url(self) -> str:
         """SQLAlchemy's URL of the database."""
         return self.database or f"sqlite:///{(self.data / 'hub.sqlite').resolve()}"
+
+    @property
+    def origin(self) -> str:
+        """The first origin of its pages: never taken from what a request says of itself."""
+        return self.origins[0] if self.origins else f"http{'s' if self.tls else ''}://localhost:{self.port}"
 
     @property
     def own_origins(self) -> tuple[str, ...]:

@@ -173,6 +173,12 @@ class Hub:
         book = self._books.get(case)
         return book is not None and any(v.phase is Phase.PROJECTING for v in book.truth.exam.versions)
 
+    def can_stop(self, case: str) -> bool:
+        """Whether something of a case is armed or lit."""
+        book = self._books.get(case)
+        phases = (Phase.ARMED, Phase.PROJECTING)
+        return book is not None and any(v.phase in phases for v in book.truth.exam.versions)
+
     async def _book(self, case: str) -> Book:
         if case not in self._books:
             made = await self._in_thread(lambda: self._read(case))

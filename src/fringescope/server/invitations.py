@@ -9,7 +9,7 @@ import argon2
 import sqlalchemy as sa
 
 from fringescope.server import database as db
-from fringescope.server.accounts import Accounts, S, Session, SignInError, digest, new_id
+from fringescope.server.accounts import LONGEST, Accounts, S, Session, SignInError, digest, new_id, plain_name
 from fringescope.server.clock import Clock
 from fringescope.wire import Invitation, PersonRole
 from fringescope.wire.documents import NewInvitation
@@ -27,12 +27,13 @@ class Invitations:
         self._hasher = argon2.PasswordHasher(time_cost=1, memory_cost=19_456, parallelism=1)
 
     def make(self, case: str, by: str, asked: NewInvitation) -> tuple[Invitation, Any]:
-        """An invitation with its link's token and its code, which are told this once, and its row."""
+        """An invitation with its link's token and its code, told this once, and its row. Raises UsageError."""
+        name = plain_name(asked.name)[: LONGEST - 20]
         token = secrets.token_urlsafe(24)
         code = "".join(secrets.choice(_LETTERS) for _ in range(8))
         row = {
             "id": new_id("invitation"), "case_id": case, "digest": digest(token), "code": self._hasher.hash(code),
-            "failures": 0, "role": asked.role, "name": asked.name,
+            "failures": 0, "role": asked.role, "name": name,
             "expires_ns": self._clock.now_ns() + int(asked.hours * 3600 * S), "revoked": False, "used_ns": None,
             "person_id": None, "made_by": by,
         }  # fmt: skip
@@ -65,20 +66,22 @@ class Invitations:
     def accept(self, token: str, code: str) -> tuple[str, Session, Invitation]:
         """A guest comes in: a session for the one case. Raises SignInError, in the same words whatever is wrong."""
         i, now = db.invitations, self._clock.now_ns()
-        with db.reading(self._engine) as c:
-            row = c.execute(sa.select(i).where(i.c.digest == digest(token))).mappings().first()
-        if row is None or row["revoked"] or row["used_ns"] is not None or row["expires_ns"] < now:
+        good = (i.c.digest == digest(token)) & i.c.used_ns.is_(None) & i.c.revoked.is_(False) & (i.c.expires_ns >= now)
+        with db.writing(self._engine) as c:  # each try is counted before it is judged
+            tried = i.update().where(good, i.c.failures < _TRIES).values(failures=i.c.failures + 1)
+            row = None
+            if c.execute(tried).rowcount == 1:
+                row = c.execute(sa.select(i).where(good)).mappings().one()
+        if row is None:
             raise SignInError(_WRONG)
         try:
             self._hasher.verify(row["code"], code.strip().upper())
         except argon2.exceptions.VerificationError:
-            failures = row["failures"] + 1
             with db.writing(self._engine) as c:
-                values = {"failures": failures, "revoked": failures >= _TRIES}
-                c.execute(i.update().where(i.c.id == row["id"]).values(values))
+                c.execute(i.update().where(i.c.id == row["id"], i.c.failures >= _TRIES).values(revoked=True))
             raise SignInError(_WRONG) from None
         with db.writing(self._engine) as c:  # of two who come at once, one
-            first = c.execute(i.update().where(i.c.id == row["id"], i.c.used_ns.is_(None)).values(used_ns=now))
+            first = c.execute(i.update().where(good).values(used_ns=now))
         if first.rowcount != 1:
             raise SignInError(_WRONG)
         person = self._accounts.add(
@@ -87,8 +90,11 @@ class Invitations:
         )  # fmt: skip
         with db.writing(self._engine) as c:
             c.execute(i.update().where(i.c.id == row["id"]).values(person_id=person.id))
+            revoked = c.execute(sa.select(i.c.revoked).where(i.c.id == row["id"])).scalar_one()
+        if revoked:  # while they came in
+            self._accounts.change(person.id, disabled=True)
         secret, session = self._accounts.open_session(person.id)
-        return secret, session, _told(row)
+        return secret, session, _told({**row, "used_ns": now})
 
 
 def _told(row: Any) -> Invitation:

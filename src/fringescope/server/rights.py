@@ -52,6 +52,7 @@ MAY: dict[str, frozenset[PersonRole]] = {
     "job.read": frozenset({OPERATOR, EXPERT, OBSERVER}),
     "job.cancel": frozenset({OPERATOR}),
     # people and the hub itself
+    "passkey": EVERYBODY,
     "people.list": frozenset({OPERATOR, ADMIN}),
     "people.change": frozenset({ADMIN}),
     "audit": frozenset({ADMIN}),

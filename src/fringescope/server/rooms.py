@@ -15,14 +15,17 @@ from fringescope.wire.room import Event, Presence, Relayed, Standing, Warned
 
 TOO_SLOW = (1013, "you read too slowly; come back with the number of the last event that you have seen")
 EXPELLED = (4403, "your right to see this case has ended")
+FLOOD = (1008, "too many messages at once; come back, and say less")
+SIGNED_OUT = (4401, "you are not signed in any more; sign in and come back")
 OVER = (1012, "the hub stops; come back")
 
 
 class Listener:
     """One connection to a room: a queue with an end."""
 
-    def __init__(self, speaker: Speaker, most: int) -> None:
-        self.speaker = speaker
+    def __init__(self, speaker: Speaker, most: int, session: str = "") -> None:
+        self.speaker, self.session = speaker, session
+        self.active = False  #: whether the person said something lately
         self.ended: tuple[int, str] | None = None
         self._most = most
         self._lines: deque[str] = deque()
@@ -72,10 +75,12 @@ class Rooms:
     def __init__(self, most: int = 4000) -> None:
         self._most = most
         self._rooms: dict[str, set[Listener]] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
 
-    def join(self, case: str, speaker: Speaker) -> Listener:
+    def join(self, case: str, speaker: Speaker, session: str = "") -> Listener:
         """A new listener; the others hear of it."""
-        made = Listener(speaker, self._most)
+        self._loop = asyncio.get_running_loop()
+        made = Listener(speaker, self._most, session)
         self._rooms.setdefault(case, set()).add(made)
         self._presence(case)
         return made
@@ -93,16 +98,43 @@ class Rooms:
         """Who is there."""
         return sorted({x.speaker.person for x in self._rooms.get(case, ())})
 
-    def count(self, case: str) -> int:
-        """How many connections there are."""
-        return len(self._rooms.get(case, ()))
+    def count(self, case: str, person: str | None = None) -> int:
+        """How many connections there are, of all or of one person."""
+        return sum(person in (None, x.speaker.person) for x in self._rooms.get(case, ()))
 
-    def expel(self, person: str, case: str | None = None) -> None:
-        """Closes whatever somebody has open, in one case or in all."""
+    def expel(self, person: str, case: str | None = None, session: str | None = None) -> None:
+        """Closes whatever somebody has open, in one case or all, of one session or all. May be called by any thread."""
+        try:
+            here = asyncio.get_running_loop()
+        except RuntimeError:
+            here = None
+        if self._loop is None or here is self._loop:
+            self._expel(person, case, session)
+        elif not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._expel, person, case, session)
+
+    def _expel(self, person: str, case: str | None, session: str | None) -> None:
         for name, room in self._rooms.items():
             for listener in room:
-                if listener.speaker.person == person and case in (None, name):
+                wanted = case in (None, name) and session in (None, listener.session)
+                if listener.speaker.person == person and wanted:
                     listener.end(EXPELLED)
+
+    def sessions(self) -> dict[str, bool]:
+        """The sessions (by digest) that have a connection open, and whether they were used since the last time."""
+        out: dict[str, bool] = {}
+        for room in self._rooms.values():
+            for listener in room:
+                out[listener.session] = out.get(listener.session, False) or listener.active
+                listener.active = False
+        return out
+
+    def end_sessions(self, ended: set[str]) -> None:
+        """Closes the connections of sessions that are over."""
+        for room in self._rooms.values():
+            for listener in room:
+                if listener.session in ended:
+                    listener.end(SIGNED_OUT)
 
     def end(self) -> None:
         """Closes all."""

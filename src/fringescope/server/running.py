@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import datetime
 import ipaddress
+import os
 import secrets
 import socket
 import threading
@@ -124,7 +126,7 @@ def self_signed(folder: Path, host: str) -> tuple[Path, Path]:
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import NameOID
 
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     certificate, key = folder / "certificate.pem", folder / "key.pem"
     now = datetime.datetime.now(datetime.UTC)
     names: list[x509.GeneralName] = [x509.DNSName("localhost")]
@@ -135,10 +137,14 @@ def self_signed(folder: Path, host: str) -> tuple[Path, Path]:
         except ValueError:
             names.append(x509.DNSName(name))
     if certificate.exists() and key.exists():
-        old = x509.load_pem_x509_certificate(certificate.read_bytes())
-        known = old.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        if old.not_valid_after_utc > now + datetime.timedelta(days=7) and set(known) >= set(names):
-            return certificate, key
+        with contextlib.suppress(ValueError, x509.ExtensionNotFound):  # of files that are none: made anew
+            old = x509.load_pem_x509_certificate(certificate.read_bytes())
+            mine = serialization.load_pem_private_key(key.read_bytes(), None).public_key()
+            known = old.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            young = old.not_valid_after_utc > now + datetime.timedelta(days=7)
+            if young and set(known) >= set(names) and mine == old.public_key():
+                key.chmod(0o600)
+                return certificate, key
     private = ec.generate_private_key(ec.SECP256R1())
     me = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Fringescope hub, self-signed")])
     made = (
@@ -155,7 +161,15 @@ def self_signed(folder: Path, host: str) -> tuple[Path, Path]:
     )
     pem = serialization.Encoding.PEM
     plain = serialization.PrivateFormat.PKCS8
-    key.touch(0o600)
-    key.write_bytes(private.private_bytes(pem, plain, serialization.NoEncryption()))
-    certificate.write_bytes(made.public_bytes(pem))
+    _write(key, private.private_bytes(pem, plain, serialization.NoEncryption()), 0o600)
+    _write(certificate, made.public_bytes(pem), 0o644)
     return certificate, key
+
+
+def _write(path: Path, data: bytes, mode: int) -> None:
+    """A file that has its mode before it has its first byte, and takes its place whole."""
+    new = path.with_suffix(".new")
+    new.unlink(missing_ok=True)
+    with os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as f:
+        f.write(data)
+    new.replace(path)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 from collections.abc import MutableMapping
 from typing import Any
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -23,7 +25,27 @@ _HEADERS = {
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
 _SAFE = ("GET", "HEAD", "OPTIONS")
-_FORWARDED = ("x-forwarded-for", "forwarded", "x-real-ip", "via", "x-forwarded-host")
+_FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "x-cluster-client-ip", "true-client-ip", "cf-ray",
+              "cf-connecting-ip", "fastly-client-ip", "x-original-host", "x-arr-log-id")  # fmt: skip
+
+
+def address_of(scope: MutableMapping[str, Any], config: Config) -> str:
+    """From where a request comes, as far as it matters for how often: who holds one address of IPv6 holds a /64.
+
+    Behind a proxy it is the last address that the proxy named: those before it anybody can write.
+    """
+    client = scope.get("client")
+    said = client[0] if client else ""
+    if config.behind_proxy:
+        named = Headers(scope=scope).getlist("x-forwarded-for")
+        said = named[-1].rsplit(",", 1)[-1].strip() if named else said
+    try:
+        address = ipaddress.ip_address(said)
+    except ValueError:
+        return client[0] if client else ""
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(address.ipv4_mapped or ipaddress.ip_network((address, 64), strict=False))
+    return str(address)
 
 
 def is_local(scope: MutableMapping[str, Any], config: Config) -> bool:
@@ -31,14 +53,33 @@ def is_local(scope: MutableMapping[str, Any], config: Config) -> bool:
     client = scope.get("client")
     if config.behind_proxy or client is None or client[0] not in LOOPBACK:
         return False
+    if scope["type"] == "http" and scope.get("http_version") == "1.0":
+        return False  # no browser and no program of ours, but proxies as they come
     headers = Headers(scope=scope)
-    return not any(h in headers for h in _FORWARDED)
+    if any(h in _FORWARDED or h.startswith("x-forwarded") for h in headers):
+        return False
+    near = (*LOOPBACK, config.host)
+    origin = headers.get("origin")
+    return _host(f"//{headers.get('host', '')}") in near and (origin is None or _host(origin) in near)
+
+
+def _host(url: str) -> str:
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:
+        return ""
 
 
 def origin_fits(scope: MutableMapping[str, Any], config: Config) -> bool:
     """Whether a request comes from a page of ours, or from no page at all: browsers always name the page's origin."""
-    origin = Headers(scope=scope).get("origin")
-    return origin is None or origin in config.own_origins
+    headers = Headers(scope=scope)
+    origins = headers.getlist("origin")
+    if not origins:
+        return headers.get("sec-fetch-site", "none") in ("none", "same-origin")
+    if len(origins) > 1:
+        return False
+    own = config.tls and origins[0] == f"https://{headers.get('host', '')}"  # who is elsewhere has no such certificate
+    return own or origins[0] in config.own_origins
 
 
 class Guarded:
@@ -49,6 +90,9 @@ class Guarded:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuses what is too often, too long or from elsewhere; adds headers to what goes out."""
+        if scope["type"] == "websocket" and self._requests.take(address_of(scope, self._config)):
+            await send({"type": "websocket.close", "code": 1013})
+            return
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -66,7 +110,7 @@ class Guarded:
                     out.setdefault("cache-control", "no-store")
             await send(message)
 
-        wait = self._requests.take(scope["client"][0] if scope.get("client") else "")
+        wait = self._requests.take(address_of(scope, self._config))
         if wait:
             await _refuse(sent, 429, f"too many requests; try again in {wait:.0f} s", {"retry-after": f"{wait:.0f}"})
             return
@@ -76,29 +120,33 @@ class Guarded:
         limits = self._config.limits
         longest = limits.upload_bytes if scope["path"] == "/api/cases/import" else limits.body_bytes
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > longest:
+        if not (length.isascii() and length.isdigit() and len(length) < 20) or int(length) > longest:
             await _refuse(sent, 413, f"a body of {length[:20]} bytes; at most {longest} are taken")
             return
         count = 0
-        began = False
+        began = over = False
 
         async def received() -> Message:
-            nonlocal count
+            nonlocal count, over
             message = await receive()
             count += len(message.get("body", b""))
             if count > longest:
+                over = True
                 raise _TooLongError
             return message
 
         async def noted(message: Message) -> None:
             nonlocal began
-            began = True
-            await sent(message)
+            if not over or began:  # whatever is made of a body that was cut off: it was too long
+                began = True
+                await sent(message)
 
         try:
             await self._app(scope, received, noted)
         except _TooLongError:
-            if not began:
+            pass
+        finally:
+            if over and not began:
                 await _refuse(sent, 413, f"a body of more than {longest} bytes; no more are taken")
 
 

@@ -21,6 +21,8 @@ from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
 from fringescope.server.lab import Lab
+from fringescope.server.openid import OpenId
+from fringescope.server.passkeys import Passkeys
 from fringescope.server.processes.parent import Child
 from fringescope.server.rooms import Rooms
 from fringescope.server.shelf import Shelf
@@ -45,6 +47,8 @@ class Site:
     requests: Throttle
     logins: Throttle
     ops: Throttle
+    passkeys: Passkeys
+    provider: OpenId | None
     lock: int
 
     def close(self) -> None:
@@ -96,7 +100,8 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
             instrument, Lab(hub, blobs, shelf, instrument, workshop, config),
             Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
-            Throttle(limits.ops_per_s, limits.ops_burst), lock,
+            Throttle(limits.ops_per_s, limits.ops_burst), Passkeys(engine, clock, accounts),
+            None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), lock,
         )  # fmt: skip
         undo.pop_all()
     return site

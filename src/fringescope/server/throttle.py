@@ -42,12 +42,13 @@ class Throttle:
     def __init__(self, rate: float, burst: float) -> None:
         self._rate, self._burst = rate, burst
         self._buckets: dict[str, Bucket] = {}
-        self._lock = threading.Lock()
+        self._lock, self._swept = threading.Lock(), 0.0
 
     def take(self, key: str, n: int = 1) -> float:
         """0 if `key` may go on with `n` more, else how many seconds it should wait."""
         with self._lock:
-            if len(self._buckets) > _MOST:
+            if len(self._buckets) > _MOST and time.monotonic() - self._swept > 1:
                 self._buckets = {k: b for k, b in self._buckets.items() if not b.full}
+                self._swept = time.monotonic()
             bucket = self._buckets.setdefault(key, Bucket(self._rate, self._burst))
             return 0.0 if bucket.take(n) else max(1.0, bucket.wait_s)

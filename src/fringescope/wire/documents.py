@@ -44,11 +44,12 @@ class Person(_Document):
 
 
 class NewPerson(_Document):
-    """An account to make."""
+    """An account to make: of who signs in by a password, by the identity provider (`subject`: who they are there)."""
 
     name: Name
-    password: Annotated[str, Field(min_length=12, max_length=1000)]
+    password: Annotated[str, Field(min_length=12, max_length=1000)] | None = None
     role: PersonRole
+    subject: Annotated[str, Field(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$")] | None = None
 
 
 class PersonChange(_Document):
@@ -78,6 +79,35 @@ class PasswordChange(_Document):
 
     old: Secret
     new: Annotated[str, Field(min_length=12, max_length=1000)]
+
+
+class Ways(_Document):
+    """How one may sign in here; `provider` is the page to open for the identity provider, None without one."""
+
+    passwords: bool = True
+    passkeys: bool = True
+    provider: str | None = None
+
+
+class KeyOptions(_Document):
+    """What a page hands to navigator.credentials.create or .get, as `publicKey`; good once, and not for long."""
+
+    options: dict[str, Any]
+
+
+class KeyAnswer(_Document):
+    """What navigator.credentials gave back (PublicKeyCredential.toJSON()); a name for the key where it is new."""
+
+    credential: dict[str, Any]
+    label: Line = ""
+
+
+class Passkey(_Document):
+    """A passkey of somebody: its public half is all that the hub has."""
+
+    id: str
+    label: str
+    created_ns: int
 
 
 class Account(_Document):

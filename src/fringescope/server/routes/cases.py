@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Query
+from fastapi import APIRouter, HTTPException, Query, Request
 from starlette.concurrency import run_in_threadpool
 
 from fringescope.server import cases as kept
@@ -12,7 +12,7 @@ from fringescope.server import database as db
 from fringescope.server import invitations as invited
 from fringescope.server import journal, truth
 from fringescope.server.accounts import new_id
-from fringescope.server.asking import CaseId, Who, problems
+from fringescope.server.asking import CaseId, Who, problems, size_of
 from fringescope.server.hub import as_event
 from fringescope.server.rights import MAY
 from fringescope.wire import Case, CaseList, Invitation, Op, Person, PersonRole, Status
@@ -40,7 +40,7 @@ def search(
     member = None if s.role in (PersonRole.OPERATOR, PersonRole.ADMIN) and s.case is None else s.person
     total, found = kept.search(
         who.site.engine, q.replace("\x00", ""), status.value if status else None, limit, offset, member,
-        _sees_patients(who),
+        _sees_patients(who), s.case,
     )  # fmt: skip
     return CaseList(total=total, cases=found)
 
@@ -124,12 +124,14 @@ async def state(case: CaseId, who: Who) -> CaseState:
 
 
 @router.post("/{case}/ops", responses=problems(401, 403, 404))
-async def say(case: CaseId, ops: list[Op], who: Who) -> list[Said]:
+async def say(case: CaseId, ops: list[Op], who: Who, request: Request) -> list[Said]:
     """Ops for the log, in order, as after a time offline: each is done once, however often it is said."""
     await run_in_threadpool(who.case, case, "case.read")
     if len(ops) > 1000:
         raise HTTPException(413, f"{len(ops)} ops at once; at most 1000 are taken")
-    who.say_so_many(len(ops))
+    stops = who.site.hub.can_stop(case)  # a stop of something that is armed or lit is never too often
+    counted = [op for op in ops if not (stops and op.what.kind == "stop")]
+    who.say_so_many(len(counted) - 1 + size_of(len(await request.body())) if counted else 0)
     out = []
     for op in ops:
         if op.what.kind == "carry_over":
@@ -153,6 +155,8 @@ async def let_in(case: CaseId, person: str, who: Who) -> Person:
     known = who.site.accounts.person(person)
     if known is None:
         raise HTTPException(404, "nobody has this account")
+    if who.site.accounts.case_of(person) not in (None, case):
+        raise HTTPException(409, "a guest sees the one case of their invitation; invite them to this one, too")
     if not await run_in_threadpool(kept.is_member, who.site.engine, case, person):
         said = await who.site.hub.note(
             case, who.speaker.person, who.speaker.role.value, "invited", {"person": person},

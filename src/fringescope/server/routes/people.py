@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fastapi import APIRouter, HTTPException
+from starlette.concurrency import run_in_threadpool
 
 from fringescope.errors import UsageError
 from fringescope.server.asking import Who, problems
@@ -24,7 +25,14 @@ def add(asked: NewPerson, who: Who) -> Person:
     """A new account."""
     who.must("people.change")
     try:
-        return who.site.accounts.add(asked.name, asked.password, asked.role)
+        if asked.password is None and asked.subject is None:
+            raise UsageError("neither a password nor a subject of the identity provider; needed one of them")
+        subject = None
+        if asked.subject is not None:
+            if who.site.provider is None:
+                raise UsageError("a subject and no identity provider; start the hub with --oidc-issuer")
+            subject = who.site.provider.subject(asked.subject)
+        return who.site.accounts.add(asked.name, asked.password, asked.role, subject=subject)
     except UsageError as e:
         raise HTTPException(400, str(e)) from None
 
@@ -32,8 +40,6 @@ def add(asked: NewPerson, who: Who) -> Person:
 @router.patch("/{person}", responses=problems(400, 401, 403, 404))
 async def change(person: str, asked: PersonChange, who: Who) -> Person:
     """Changes an account; who loses a right is out at once, from every room."""
-    from starlette.concurrency import run_in_threadpool
-
     who.must("people.change")
     if who.site.accounts.person(person) is None:
         raise HTTPException(404, "nobody has this account")

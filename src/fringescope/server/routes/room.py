@@ -17,10 +17,10 @@ from fringescope.errors import DeviceError, FringescopeError
 from fringescope.server import database as db
 from fringescope.server import journal, truth
 from fringescope.server.accounts import SignInError
-from fringescope.server.asking import Asking, asking_of, may_see
+from fringescope.server.asking import Asking, asking_of, may_see, size_of, still
 from fringescope.server.hub import as_event
 from fringescope.server.rights import refusal
-from fringescope.server.rooms import EXPELLED, Listener
+from fringescope.server.rooms import EXPELLED, FLOOD, Listener
 from fringescope.server.security import origin_fits
 from fringescope.server.throttle import Bucket
 from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Relayed, Say, Standing, Welcome
@@ -28,6 +28,7 @@ from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Rel
 router = APIRouter()
 _MESSAGE: TypeAdapter[Any] = TypeAdapter(FromClient)
 _PAGE = 500
+_LAST_WORD_S = 2.0  #: how long a browser has to hear why its connection is closed
 
 
 async def _enter(socket: WebSocket, case: str, what: str) -> Asking | None:
@@ -63,19 +64,23 @@ async def room(socket: WebSocket, case: str, since: int = 0) -> None:
     if asking is None:
         return
     site = asking.site
-    if site.rooms.count(case) >= site.config.limits.present:
+    most, person = site.config.limits.present, asking.speaker.person
+    if site.rooms.count(case) >= most or site.rooms.count(case, person) >= max(1, most // 2):
         await _close(socket, 1013, "this room is full; try again later")
         return
     await socket.accept()
-    listener = site.rooms.join(case, asking.speaker)  # from here on nothing is missed
+    listener = site.rooms.join(case, asking.speaker, asking.session.digest)  # from here on nothing is missed
+    if not await run_in_threadpool(still, asking, case):  # a right that was taken away while they came in
+        listener.end(EXPELLED)
     sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since)))
     try:
         await _receive(socket, asking, case, listener)
     finally:
         site.rooms.leave(case, listener)
-        sender.cancel()
+        if listener.ended is None:
+            sender.cancel()
         with contextlib.suppress(asyncio.CancelledError, Exception):
-            await sender
+            await asyncio.wait_for(sender, _LAST_WORD_S)
 
 
 async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int) -> None:
@@ -110,6 +115,7 @@ async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener
 async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Listener) -> None:
     site, limits = asking.site, asking.site.config.limits
     live = Bucket(limits.live_per_s, 2 * limits.live_per_s)
+    every = Bucket(limits.messages_per_s, limits.messages_burst)
     waiting: set[asyncio.Task[None]] = set()
     try:
         while listener.ended is None:
@@ -117,6 +123,11 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             if message["type"] == "websocket.disconnect":
                 return
             text = message.get("text") or ""
+            if listener.ended is not None:  # while this message was on its way
+                return
+            if not every.take():
+                listener.end(FLOOD)
+                return
             if not site.accounts.allowed(asking.speaker.person):
                 listener.end(EXPELLED)
                 return
@@ -128,10 +139,11 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             except ValidationError as e:
                 listener.send(_refused(_why(e)))
                 continue
+            listener.active = listener.active or not isinstance(said, Ping)
             if isinstance(said, Ping):
                 listener.send(Pong(at_ms=said.at_ms).model_dump_json())
             elif isinstance(said, Say):
-                await _say(asking, case, listener, said, waiting)
+                await _say(asking, case, listener, said, waiting, size_of(len(text)))
             elif (why := refusal(asking.speaker, said.type)) or not live.take():
                 if why:
                     listener.send(_refused(why))
@@ -143,10 +155,12 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
                 await task
 
 
-async def _say(asking: Asking, case: str, listener: Listener, said: Say, waiting: set[asyncio.Task[None]]) -> None:
-    """An op on its way to the log; a stop is never too often."""
+async def _say(
+    asking: Asking, case: str, listener: Listener, said: Say, waiting: set[asyncio.Task[None]], size: int
+) -> None:
+    """An op on its way to the log; a stop of something that is armed or lit is never too often."""
     what = said.op.what.kind
-    if what != "stop" and asking.site.ops.take(asking.speaker.person):
+    if not (what == "stop" and asking.site.hub.can_stop(case)) and asking.site.ops.take(asking.speaker.person, size):
         listener.send(_refused(f"op {said.op.number}: too many ops; wait a moment and say it again"))
         return
     if what == "carry_over":
@@ -217,7 +231,7 @@ async def video(socket: WebSocket, case: str, camera: str) -> None:
     site.instrument.watching += 1
     level, number = 1, 0
     try:
-        while site.accounts.allowed(asking.speaker.person):
+        while await run_in_threadpool(still, asking, case):
             width, quality = QUALITIES[level]
             try:
                 frame = await site.instrument.live(camera, width, quality)
