@@ -320,7 +320,7 @@ def test_the_command_with_a_pattern_and_without_registration(scans: Path, tmp_pa
 def test_strokes_are_drawn_as_guide_draws_them_and_a_bad_one_costs_itself_alone(scans: Path, tmp_path: Path) -> None:
     document = json.loads((scans / "after" / "scan.json").read_text())
     strokes = [
-        {"id": "ring", "kind": "circle", "camera": "camera1", "pixels": [[164, 110]], "radius_mm": 5.0},
+        {"id": "ring", "kind": "circle", "camera": "camera1", "pixels": [[150, 90]], "radius_mm": 3.0},
         {"id": "bad", "world_mm": [[0, 0, None], [1, 1, 1]]},
     ]
     drawn = tmp_path / "g.json"

@@ -88,6 +88,7 @@ ROUTES: dict[str, Row] = {
     "POST /api/cases/{case}/scans": Row("operator", 202, {}),
     "POST /api/cases/{case}/carry": Row("operator", 202, {"version": 1}),
     "POST /api/cases/{case}/carry_over": Row("operator", 400, OP),
+    "POST /api/cases/{case}/compare": Row("operator", 202, {"before": "a", "after": "b"}),
     "GET /api/cases/{case}/files": Row(ALL, 200),
     "GET /api/cases/{case}/files/{sha256}": Row(ALL, 404),
     "GET /api/jobs": Row("operator", 200),
@@ -95,6 +96,8 @@ ROUTES: dict[str, Row] = {
     "DELETE /api/jobs/{job}": Row("operator", 404),
     "GET /api/instrument": Row(ALL, 200),
     "POST /api/instrument/stop": Row(ALL, 200),
+    "POST /api/instrument/poses": Row("operator", 202, {}),
+    "POST /api/instrument/calibrate": Row("operator", 202),
     "POST /api/instrument/simulate": Row("operator", 503, {"move": "1,0,0"}),
     "GET /api/audit": Row("admin", 200),
 }
@@ -113,7 +116,7 @@ SAID: dict[str, tuple[str, dict[str, Any]]] = {
     "preview": ("operator", {"version": 1}),
     "arm": ("operator", {"version": 1, "content": "x", "pattern": "x"}),
     "start": ("operator", {"version": 1, "pattern": "x"}),
-    "acknowledge": ("operator", {"suspect_ns": 1}),
+    "acknowledge": ("operator", {"suspect": "1"}),
     "stop": (ALL, {}),
     "carry_over": ("", {"version": 1, "scan": SCAN, "job": "job-1"}),  # by its own route alone
 }
