@@ -89,6 +89,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "serving",
         "Accounts of a hub that does not run just now; a password is asked for, or read from a pipe.",
     ),
+    "audit": (
+        "auditing",
+        "A hub's log, judged: was any event altered, removed or added? Signed checkpoints of it; it may run meanwhile.",
+    ),
     "bench": (
         "timing",
         "Times a scan against a plain copy of the same memory and against other decoders, all in one run.",

@@ -1,4 +1,4 @@
-"""Verbs of the hub: serve, person, audit."""
+"""Verbs of the hub: serve, person."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Database = Annotated[
 HOME = Path("fringescope-hub")
 
 
-def _needs_extra() -> None:
+def needs_extra() -> None:
     """Raises UsageError where the hub's packages are missing."""
     try:
         import fastapi
@@ -60,7 +60,7 @@ def serve(
     set_: SetOption = None,
 ) -> None:
     """The hub: cases, shared drawing, and the instrument, for the operator here and experts anywhere."""
-    _needs_extra()
+    needs_extra()
     from fringescope.server import running
     from fringescope.server.config import Config
 
@@ -80,7 +80,7 @@ def serve(
 
 
 def _config(data: Path, database: str | None) -> Config:
-    _needs_extra()
+    needs_extra()
     from fringescope.server.config import Config
 
     if not data.is_dir() and database is None:
@@ -98,7 +98,7 @@ def person(
     json: Json = False,
 ) -> None:
     """Accounts of a hub that does not run just now; a password is asked for, or read from a pipe."""
-    _needs_extra()
+    needs_extra()
     from fringescope.server.site import open_site
     from fringescope.wire import PersonRole
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -27,12 +28,15 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
     async def life(_app: FastAPI) -> AsyncIterator[None]:
         await site.hub.start()
         await site.instrument.start()
+        points = asyncio.create_task(site.checkpoints.run(config.checkpoint_s), name="checkpoints")
         try:
             yield
         finally:
             site.rooms.end()
             await site.jobs.stop()
+            points.cancel()
             await site.hub.stop()
+            await site.checkpoints.try_to_write()
             await site.instrument.stop()
             site.close()
 

@@ -52,6 +52,7 @@ class Config:
     behind_proxy: bool = False  #: another server hands requests on: nobody is local by their address alone
     settings: Settings = field(default_factory=Settings)
     limits: Limits = Limits()
+    checkpoint_s: float = 300.0  #: a signed checkpoint of the log so often, if it has moved
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.key is None):

@@ -14,6 +14,7 @@ from fringescope.server import database as db
 from fringescope.server import journal
 from fringescope.server.accounts import Accounts
 from fringescope.server.blobs import Blobs
+from fringescope.server.checkpoints import Checkpoints
 from fringescope.server.clock import Clock
 from fringescope.server.config import Config
 from fringescope.server.hub import Hub
@@ -41,6 +42,7 @@ class Site:
     requests: Throttle
     logins: Throttle
     ops: Throttle
+    checkpoints: Checkpoints
     lock: int
 
     def close(self) -> None:
@@ -84,12 +86,13 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         rooms = Rooms(limits.waiting)
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
+        checkpoints = Checkpoints(engine, clock, config.data)
         accounts.gone = rooms.expel
         site = Site(
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
             Instrument(hub, blobs, config), Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
-            Throttle(limits.ops_per_s, limits.ops_burst), lock,
+            Throttle(limits.ops_per_s, limits.ops_burst), checkpoints, lock,
         )  # fmt: skip
         undo.pop_all()
     return site

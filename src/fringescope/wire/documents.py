@@ -271,6 +271,8 @@ class AuditReport(_Document):
     events: int
     faults: list[str]
     whole: bool
+    checkpoints: int = 0
+    covered_ns: int = 0  #: until then a tail that was cut off would have been missed
 
 
 class Health(_Document):
