@@ -6,7 +6,7 @@ import json
 import shutil
 import sqlite3
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -391,14 +391,14 @@ def test_the_triggers_refuse_by_themselves(folder: Path) -> None:
 
 
 @pytest.fixture
-def told(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., tuple[int, Any]]]:
+def told(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, Any]]:
     def run(*args: str) -> tuple[int, Any]:
         capsys.readouterr()
         status = cli.run(["audit", *args, "--json"])
         out = capsys.readouterr().out
         return status, json.loads(out) if out.strip() else None
 
-    yield run
+    return run
 
 
 def test_the_command_tells_whole_from_not_whole(folder: Path, tmp_path: Path, told: Any) -> None:

@@ -57,9 +57,7 @@ def audit(
         if what == "verify":
             wanted = None if key is None else points.raw(points.read_public(key))
             found = judge.verify(engine, data, checkpoints or [], wanted, files)
-            told = {"cases": found.cases, "events": found.events, "checkpoints": found.checkpoints,
-                    "covered_ns": found.covered_ns, "key": found.key, "whole": found.whole, "faults": found.faults}  # fmt: skip
-            emit(told, json, _lines(found))
+            emit({**vars(found), "whole": found.whole}, json, _lines(found))
             if not found.whole:
                 raise typer.Exit(1)
             return

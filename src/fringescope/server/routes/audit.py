@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from fringescope import __version__
-from fringescope.server.audit import verify
 from fringescope.server.asking import Parts, Who, problems
+from fringescope.server.audit import verify
 from fringescope.wire.documents import AuditReport, Health
 
 router = APIRouter(prefix="/api", tags=["hub"])
