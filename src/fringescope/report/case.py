@@ -1,4 +1,4 @@
-"""A case as a report for people: specimen, pictures with the strokes drawn, measurements, versions, words, signatures."""
+"""A case as a report for people: specimen, pictures with strokes, measurements, versions, words, signatures."""
 
 from __future__ import annotations
 
@@ -148,8 +148,8 @@ def _versions(doc: Mapping[str, Any], pictures: Mapping[str, U8]) -> list[Part]:
     if not doc["versions"]:
         return [Part("Guidelines", ["None was submitted."])]
     rows = [
-        [str(v["number"]), _name(doc, v["author"]), when(v["since_ns"]), v["phase"] + (f": {v['why']}" if v["why"] else ""),
-         str(v["strokes"]), f"{v['content'][:16]}…"]
+        [str(v["number"]), _name(doc, v["author"]), when(v["since_ns"]),
+         v["phase"] + (f": {v['why']}" if v["why"] else ""), str(v["strokes"]), f"{v['content'][:16]}…"]
         for v in doc["versions"]
     ]  # fmt: skip
     head = ("No.", "By", "Since", "State", "Strokes", "Content")

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException as RawHTTPException
 from fringescope import __version__
 from fringescope.errors import FringescopeError, OutputError
 from fringescope.server.config import Config
-from fringescope.server.routes import audit, cases, people, room, scans, signing
+from fringescope.server.routes import audit, cases, leaving, people, room, scans, signing
 from fringescope.server.security import Guarded
 from fringescope.server.site import open_site
 
@@ -34,6 +34,7 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         finally:
             site.rooms.end()
             await site.jobs.stop()
+            await site.leaving.stop()
             points.cancel()
             await site.hub.stop()
             await site.checkpoints.try_to_write()
@@ -50,7 +51,7 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         openapi_url="/openapi.json",
     )
     app.state.site = site
-    for part in (signing, people, cases, scans, audit, room):
+    for part in (signing, people, leaving, cases, scans, audit, room):
         app.include_router(part.router)
     _explain(app)
     app.add_middleware(Guarded, config=config, requests=site.requests)

@@ -198,6 +198,8 @@ class Instrument:
         strokes = [dict(x["stroke"]) for x in truth.versions[version]]
         folder = Path(tempfile.mkdtemp(dir=self._work(), prefix="check-"))
         try:
+            if v.rig != self.rig_hash():
+                raise UsageError(f"the scan was made with another rig than this instrument's ({v.rig[:19]}); scan again")
             made = await self._workshop.call(
                 "guide", scan=str(await self._scan_folder(case, v.scan)), rig=str(self._rig_file()),
                 settings=json.dumps(self._settings), strokes=strokes, out=str(folder),
@@ -212,6 +214,9 @@ class Instrument:
         by_name = {f.name: f.sha256 for f in files}
         files = [f.model_copy(update={"name": made["files"][f.name], "type": cases.type_of(made["files"][f.name])})
                  for f in files]  # fmt: skip
+        if (await self._hub.truth_of(case))[0].erased:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
+            return
         with db.writing(self._hub.engine) as c:
             cases.insert_files(c, case, f"version-{version}", files)
         problems = tuple(" ".join(p.split())[:190] for p in made["problems"])
@@ -327,29 +332,46 @@ class Instrument:
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    async def keep(self, case: str, label: str, folder: Path, doc: dict[str, Any]) -> dict[str, Any]:
-        """A scan's folder into the case: its files first, then one transaction with the event."""
+    async def forget(self, case: str) -> None:
+        """Nothing of a case stays in the memory of its processes. Raises UsageError while it is projected."""
+        if self._shown is not None and self._shown[0] == case:
+            raise UsageError("a guideline of this case is projected; stop it first")
+        if self._case == case:
+            await self._rest()
+        if self._workshop.alive:
+            self._begin(self._reported(case, self._workshop.call("forget")))  # once it has done what it does
+
+    async def keep(
+        self, case: str, label: str, folder: Path, doc: dict[str, Any], taken_ns: int | None = None,
+        present: bool = True,
+    ) -> dict[str, Any]:  # fmt: skip
+        """A scan's folder into the case: its files first, then one transaction with the event.
+
+        Without `present` it is there to look at, and the case stays at the scan that it has.
+        """
         named = {str(p.relative_to(folder)): p for p in sorted(folder.rglob("*")) if p.is_file()}
         files: list[ScanFile] = await asyncio.to_thread(cases.keep_files, self._blobs, named)
         kept = ("figures", "views", "cloud", "surface", "created", "instrument")
         info = ScanInfo(
-            id=doc["hash"], case=case, rig=doc["rig"], label=label, taken_ns=self._hub.clock.now_ns(), files=files,
-            figures={k: doc[k] for k in kept if k in doc},
+            id=doc["hash"], case=case, rig=doc["rig"], label=label, taken_ns=taken_ns or self._hub.clock.now_ns(),
+            files=files, figures={k: doc[k] for k in kept if k in doc},
         )  # fmt: skip
         truth, _ = await self._hub.truth_of(case)
-        if truth.exam.rig not in ("", doc["rig"]):
+        if present and truth.exam.rig not in ("", doc["rig"]):
             await self._hub.tell(case, RigChanged(doc["rig"]))
         word = {"scan": info.id, "rig": info.rig, "label": label, "files": len(files)}
         said = await self._hub.note(
-            case, INSTRUMENT, INSTRUMENT, ScanTaken.__name__, word,
+            case, INSTRUMENT, INSTRUMENT, ScanTaken.__name__ if present else "evidence", word,
             lambda c: cases.insert_scan(c, info),
         )  # fmt: skip
         if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
             raise UsageError(said.refused)
         if truth.exam.lost:
             for device in truth.exam.lost:
                 await self._hub.tell(case, DeviceBack(device))
-        self._begin(self._prepare(case, info.id))
+        if present:
+            self._begin(self._prepare(case, info.id))
         return {"scan": info.id, "seq": said.seq}
 
     async def _prepare(self, case: str, scan: str) -> None:
@@ -411,5 +433,4 @@ class Instrument:
         files = (await asyncio.to_thread(cases.files_of, self._hub.engine, case, scan)).get(scan)
         if not files:
             raise UsageError(f"case {case} has no scan {scan[:19]}; scan again")
-        folder = self._config.data / "laid-out" / scan.replace("sha256:", "")[:32]
-        return await asyncio.to_thread(cases.laid_out, self._blobs, files, folder)
+        return await asyncio.to_thread(cases.lay_out, self._blobs, files, self._config.data, case, scan)

@@ -15,6 +15,7 @@ from fringescope.wire.room import Event, Presence, Relayed, Standing, Warned
 
 TOO_SLOW = (1013, "you read too slowly; come back with the number of the last event that you have seen")
 EXPELLED = (4403, "your right to see this case has ended")
+ERASED = (4410, "this case was erased")
 OVER = (1012, "the hub stops; come back")
 
 
@@ -53,6 +54,12 @@ class Listener:
             self.ended = why
             self._lines.clear()
             self._live.clear()
+        self._wake.set()
+
+    def end_soon(self, why: tuple[int, str]) -> None:
+        """No more messages after those that wait."""
+        if self.ended is None:
+            self.ended = why
         self._wake.set()
 
     async def next(self) -> list[str]:
@@ -103,6 +110,11 @@ class Rooms:
             for listener in room:
                 if listener.speaker.person == person and case in (None, name):
                     listener.end(EXPELLED)
+
+    def close(self, case: str, why: tuple[int, str]) -> None:
+        """Closes one room, once everybody in it has been sent what waits for them."""
+        for listener in self._rooms.get(case, ()):
+            listener.end_soon(why)
 
     def end(self) -> None:
         """Closes all."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import MutableMapping
 from typing import Any
 
@@ -23,6 +24,7 @@ _HEADERS = {
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
 _SAFE = ("GET", "HEAD", "OPTIONS")
+_UPLOADS = re.compile(r"/api/cases/(import|[^/]+/scans/import)")
 _FORWARDED = ("x-forwarded-for", "forwarded", "x-real-ip", "via", "x-forwarded-host")
 
 
@@ -74,7 +76,7 @@ class Guarded:
             await _refuse(sent, 403, "this request comes from another site's page; open the hub's own page")
             return
         limits = self._config.limits
-        longest = limits.upload_bytes if scope["path"] == "/api/cases/import" else limits.body_bytes
+        longest = limits.upload_bytes if _UPLOADS.fullmatch(scope["path"]) else limits.body_bytes
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > longest:
             await _refuse(sent, 413, f"a body of {length[:20]} bytes; at most {longest} are taken")

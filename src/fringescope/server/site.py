@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from fringescope.server.hub import Hub
 from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
+from fringescope.server.leaving import Leaving
 from fringescope.server.rooms import Rooms
 from fringescope.server.throttle import Throttle
 
@@ -43,6 +45,7 @@ class Site:
     logins: Throttle
     ops: Throttle
     checkpoints: Checkpoints
+    leaving: Leaving
     lock: int
 
     def close(self) -> None:
@@ -79,6 +82,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         engine = db.open_engine(config.url)
         undo.callback(engine.dispose)
         db.migrate(engine)
+        shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         clock = Clock(journal.last_ns(engine))
         blobs = Blobs(config.data / "files")
         limits = config.limits
@@ -86,13 +90,15 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         rooms = Rooms(limits.waiting)
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
+        instrument = Instrument(hub, blobs, config)
         checkpoints = Checkpoints(engine, clock, config.data)
         accounts.gone = rooms.expel
         site = Site(
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
-            Instrument(hub, blobs, config), Throttle(limits.requests_per_s, limits.requests_burst),
+            instrument, Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
-            Throttle(limits.ops_per_s, limits.ops_burst), checkpoints, lock,
+            Throttle(limits.ops_per_s, limits.ops_burst), checkpoints,
+            Leaving(config, hub, blobs, accounts, jobs, instrument, checkpoints), lock,
         )  # fmt: skip
         undo.pop_all()
     return site
