@@ -203,12 +203,15 @@ def _signatures(doc: Mapping[str, Any]) -> list[Part]:
     if not doc["signatures"]:
         return [Part("Signatures", ["Nothing was signed."])]
     rows = [
-        [_name(doc, s["actor"]), s["role"], when(s["at_ns"]), f"{s['meaning']}, version {s['version']}", s["content"]]
+        [_name(doc, s["actor"]), s["role"], when(s["at_ns"]), f"{s['meaning']}, version {s['version']}"]
         for s in doc["signatures"]
     ]
     line = "Each was given with the password of the person, and is bound to the content hash of the version."
-    head = ("Printed name", "Role", "Time", "Meaning", "Content hash")
-    return [Part("Signatures", [line], head, rows, (4, 2.5, 4, 4, 6))]
+    bound = {(s["version"], s["content"]): None for s in doc["signatures"]}
+    return [
+        Part("Signatures", [line], ("Printed name", "Role", "Time", "Meaning"), rows, (5, 3, 5, 5)),
+        Part("What was signed", (), ("Version", "Content hash"), [[str(v), c] for v, c in bound], (1, 7), level=2),
+    ]
 
 
 def _about(doc: Mapping[str, Any]) -> Part:

@@ -199,7 +199,7 @@ class Instrument:
         folder = Path(tempfile.mkdtemp(dir=self._work(), prefix="check-"))
         try:
             if v.rig != self.rig_hash():
-                raise UsageError(f"the scan was made with another rig than this instrument's ({v.rig[:19]}); scan again")
+                raise UsageError(f"the scan was made with another rig than this one's ({v.rig[:19]}); scan again")
             made = await self._workshop.call(
                 "guide", scan=str(await self._scan_folder(case, v.scan)), rig=str(self._rig_file()),
                 settings=json.dumps(self._settings), strokes=strokes, out=str(folder),

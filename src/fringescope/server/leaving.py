@@ -106,7 +106,7 @@ class Leaving:
             head = {"made_ns": made_ns, "people": people,
                     "patient": None if patient is None else patient.model_dump()}  # fmt: skip
             out = folder / "bundle.zip"
-            await asyncio.to_thread(bundle.write, out, g, made, self._blobs, head, self._key)
+            await asyncio.to_thread(bundled.write, out, g, made, self._blobs, head, self._key)
             return out
 
     def _prepare(
