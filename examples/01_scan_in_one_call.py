@@ -31,4 +31,6 @@ def main(out: Path, scale: float = 0.125) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (2, 3):
+        sys.exit(str(__doc__))
     main(Path(sys.argv[1]), *(float(x) for x in sys.argv[2:3]))

@@ -50,6 +50,13 @@ def test_lines_on_the_tissue(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "preview-camera3.png").exists()
 
 
+def test_a_case_at_the_hub(tmp_path: Path) -> None:
+    pytest.importorskip("fastapi", reason="needs fringescope[server]")
+    said = run("07_a_case_at_the_hub.py", str(tmp_path / "out"), "0.05")
+    assert "projected; the expert sees it, too: projecting\nthat is enough: dark\n" in said
+    assert (tmp_path / "out" / "projected.jpg").read_bytes()[:2] == b"\xff\xd8"
+
+
 def test_the_parts_take_away_and_never_add() -> None:
     left = [int(n) for n in re.findall(r"leaves (\d+) of", run("02_the_parts.py", "0.04"))]
     assert len(left) == 5

@@ -197,7 +197,7 @@ def test_blown_views_give_one_line_and_no_scan(rig, views):
 
 
 def test_a_capture_without_views_gives_one_line(rig):
-    with pytest.raises(EmptyResultError, match="no point was left"):
+    with pytest.raises(EmptyResultError, match="no view to scan"):
         pipeline.scan([], rig)
 
 
@@ -211,6 +211,25 @@ def test_frames_of_another_size_than_the_rig_s(rig, views):
     cut = ViewInput(views[0].plan, [(k, f[:70]) for k, f in views[0].frames])
     with pytest.raises(DecodeError, match=r"frames of 96 x 70 pixels, the rig was calibrated at 96 x 72"):
         pipeline.scan([cut], rig)
+
+
+@pytest.mark.parametrize("spoilt", ["int8", "bool", "rows", "columns"])
+def test_frames_that_hold_no_pixels_give_one_line(rig, views, spoilt):
+    wrong = {
+        "int8": lambda a: a.astype(np.int8), "bool": lambda a: a > 100, "rows": lambda a: a[:0],
+        "columns": lambda a: a[:, :0],
+    }[spoilt]  # fmt: skip
+    bad = ViewInput(views[0].plan, [(key, wrong(f)) for key, f in views[0].frames])
+    with pytest.raises(CaptureError, match="needed pixels, as uint8 or uint16"):
+        pipeline.scan([bad], rig)
+
+
+def test_samples_of_another_byte_order_are_the_same_samples(rig, views):
+    swapped = ViewInput(views[0].plan, [(key, f.astype(">u2")) for key, f in views[0].frames])
+    native = ViewInput(views[0].plan, [(key, f.astype(np.uint16)) for key, f in views[0].frames])
+    a, b = (pipeline.decode_view(v, Settings()).directions[0].phase for v in (swapped, native))
+    np.testing.assert_array_equal(a, b)
+    assert len(pipeline.scan([swapped], rig, surface=False).cloud) > 1000
 
 
 def test_missing_frames(rig, views):

@@ -269,7 +269,10 @@ def _others(view: ViewInput, python: Path | None, repeat: int) -> dict[str, floa
             raise UsageError(f"--peer-python {python}: cannot be run: {e.strerror}") from e
     if done.returncode != 0:
         return out | {"fringes": (done.stderr.strip().splitlines() or ["it said nothing"])[-1]}
-    told: dict[str, float | str] = json.loads(done.stdout.splitlines()[-1])
+    try:
+        told: dict[str, float | str] = json.loads(done.stdout.splitlines()[-1])
+    except (IndexError, json.JSONDecodeError):
+        raise UsageError(f"--peer-python {python}: said {done.stdout[:40]!r}; needed a Python interpreter") from None
     return out | told
 
 

@@ -44,8 +44,12 @@ def intensity(frame: AnyArray, pixel_format: PixelFormat) -> AnyArray:
     """One sample per pixel: raw Bayer and mono frames as they are, RGB as the sum of its channels (uint16).
 
     A pixel with one saturated channel counts as saturated: it gets the largest sum. Raises CaptureError if the frame is
-    not (H, W), or (H, W, 3) for RGB.
+    not (H, W), or (H, W, 3) for RGB, is empty, or holds neither unsigned integers nor floating-point numbers.
     """
+    if frame.dtype.kind not in "uf" or frame.size == 0:
+        raise CaptureError(f"a frame of shape {frame.shape}, {frame.dtype}; needed pixels, as uint8 or uint16")
+    if not frame.dtype.isnative:
+        frame = frame.astype(frame.dtype.newbyteorder("="))
     frame = unpacked(frame, pixel_format)
     rgb = pixel_format is PixelFormat.RGB8
     if frame.ndim != (3 if rgb else 2) or (rgb and frame.shape[2] != 3):

@@ -376,6 +376,8 @@ def scan(
     """
     s = settings or Settings()
     check_device(device)
+    if not views:
+        raise EmptyResultError("no view to scan; needed the frames of one camera at least")
     arrival.check_memory(views, rig)
     tell = progress or _silent
     times: dict[str, float] = {}

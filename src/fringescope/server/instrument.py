@@ -7,6 +7,7 @@ file with the hash that was confirmed. Darkness goes two ways at once: a word to
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import json
 import shutil
@@ -70,6 +71,7 @@ class Instrument:
         self._busy = ""
         self._why = ""
         self._open = False
+        self._cameras: tuple[str, ...] = ()
         self.watching = 0  #: streams of video
         self._hand = asyncio.Lock()  #: one thing at a time is done with the devices
         hub.carry_out = self.carry_out
@@ -92,7 +94,8 @@ class Instrument:
         if self._open and self._devices.alive:
             return
         try:
-            await self._devices.call("open", uri=uri)
+            found = await self._devices.call("open", uri=uri)
+            self._cameras = tuple(c["name"] for c in found["cameras"])
             if self._rig is None:
                 made = self._config.data / "twin-rig.json"
                 await self._devices.call("twin_rig", out=str(made))
@@ -104,11 +107,22 @@ class Instrument:
 
     async def stop(self) -> None:
         """Dark, and the processes end."""
+        self.dark("the hub ends")
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._devices.stop()
         await self._workshop.kill()
+
+    @property
+    def pid(self) -> int | None:
+        """The process that holds the devices."""
+        return self._devices.pid
+
+    @property
+    def button(self) -> StopButton | None:
+        """The stop button of the watchdog, while there is one."""
+        return self._button
 
     def state(self) -> InstrumentState:
         """How it is, for the operator's screen."""
@@ -177,7 +191,7 @@ class Instrument:
                 self._begin(self._reported(case, self._check(case, effect.version, fold.truth)))
             elif isinstance(effect, Show):
                 self._shown, self._lit_s = (case, effect.pattern), time.monotonic()
-                self._begin(self._reported(case, self._show(effect.version, fold.truth)))
+                self._begin(self._reported(case, self._show(case, effect, fold.truth)))
             elif isinstance(effect, Dark) and self._shown is not None and self._shown[0] == case:
                 self.dark(effect.why)
         if record.kind == "preview":
@@ -252,14 +266,31 @@ class Instrument:
         if found["validity"] is not None:
             await self._hub.tell(case, Watched(scan, Standing(found["validity"])))
 
-    async def _show(self, version: int, truth: Truth) -> None:
-        v = next(x for x in truth.exam.versions if x.number == version)
+    async def _show(self, case: str, effect: Show, truth: Truth) -> None:
+        v = next(x for x in truth.exam.versions if x.number == effect.version)
         try:
-            await self._devices.call("show", whole=v.pattern, dashed=v.dashed)
+            made = await self._devices.call("show", whole=v.pattern, dashed=v.dashed)
         except FringescopeError as e:
             self._shown = None
             await self._lost(str(e))
             raise
+        await self._testify(case, effect, made["shown_ns"])
+
+    async def _testify(self, case: str, effect: Show, shown_ns: int) -> None:
+        """Photographs of what was projected go into the case, with when it was."""
+        files = []
+        for camera in self._cameras:
+            with contextlib.suppress(FringescopeError):
+                frame = await self._devices.call("live", camera=camera, width=1280, quality=85)
+                data = base64.b64decode(frame["jpeg"])
+                sha256, size = await asyncio.to_thread(self._blobs.put, data)
+                files.append(ScanFile(name=f"{camera}.jpg", sha256=sha256, size=size, type="image/jpeg"))
+        told = {"version": effect.version, "pattern": effect.pattern, "shown_ns": shown_ns,
+                "pictures": {f.name: f.sha256 for f in files}}  # fmt: skip
+        owner = f"evidence-{shown_ns}"
+        await self._hub.note(
+            case, INSTRUMENT, INSTRUMENT, "evidence", told, lambda c: cases.insert_files(c, case, owner, files)
+        )
 
     # ----------------------------------------------------------------------------------------------------- what it says
 

@@ -259,7 +259,7 @@ def word_of(kind: str, payload: Mapping[str, Any]) -> What:
         case "start":
             return Start(payload["version"], payload["pattern"])
         case "acknowledge":
-            return Acknowledge(payload["suspect_ns"])
+            return Acknowledge(int(payload["suspect"]))
         case "stop":
             return Stop(payload.get("version"), payload.get("why", ""))
         case "carry_over":
@@ -289,10 +289,11 @@ def _applied(
 def standing(truth: Truth) -> dict[str, Any]:
     """What people need to know of an examination, as plain values."""
     e = examination.to_dict(truth.exam)
-    keep = ("rig", "scan", "validity", "verdict_ns", "suspect_ns", "acknowledged", "guarded", "lost", "versions")
+    keep = ("rig", "scan", "validity", "acknowledged", "guarded", "lost", "versions")
     shown = examination.shown(truth.exam)
     return {
         **{k: e[k] for k in keep},
+        "suspect": str(truth.exam.suspect_ns),
         "shown": None if shown is None else {"version": shown.version, "pattern": shown.pattern},
         "signatures": [dict(x) for x in truth.signatures],
     }

@@ -136,10 +136,12 @@ class Start(_Said):
 
 
 class Acknowledge(_Said):
-    """The operator goes on although the specimen has been suspect since then."""
+    """The operator goes on although the specimen has been suspect since then, `suspect` of the standing: a browser's
+    numbers cannot hold its nanoseconds.
+    """
 
     kind: Literal["acknowledge"] = "acknowledge"
-    suspect_ns: int
+    suspect: Annotated[str, Field(pattern=r"^[0-9]{1,19}$")]
 
 
 class Stop(_Said):

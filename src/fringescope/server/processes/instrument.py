@@ -40,11 +40,14 @@ class _Ready:
     """What is ready to be projected: its pictures by hash, a guard, and a thread that looks at the specimen."""
 
     def __init__(
-        self, station: Station, scan: str, look: Callable[[_Ready], Any], s: Settings, emit: Emit, cameras: Lock
+        self, station: Station, scan: str, look: Callable[[Any], Any], masks: Callable[[U8], Any], s: Settings,
+        emit: Emit, cameras: Lock,
     ) -> None:  # fmt: skip
         self.station, self.scan, self.s = station, scan, s
         self._emit, self._cameras = emit, cameras
         self.images: dict[str, U8] = {}
+        self._masks: dict[str, Any] = {}
+        self._masks_of = masks
         self.pair: tuple[str, str] | None = None  #: what is shown, whole and dashed
         self.standing: Standing | None = None
         self._lit: U8 | None = None
@@ -52,6 +55,13 @@ class _Ready:
         self._failed = 0
         self.guard = Guard(station.projector, s.guard)
         self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
+
+    def load(self, images: dict[str, U8]) -> None:
+        """Pictures that may be shown, by hash, and where each changes what the cameras see."""
+        for name, image in images.items():
+            if name not in self.images:
+                self._masks[name] = self._masks_of(image)
+                self.images[name] = image
 
     def begin(self) -> None:
         """Looks for the first time, which takes longest, and only then starts what must not be kept waiting."""
@@ -65,7 +75,7 @@ class _Ready:
         before = self.pair
         try:
             with self._cameras:
-                verdict = self._look(self)
+                verdict = self._look(None if before is None else self._masks[before[0]])
         except FringescopeError as e:
             self._failed += 1
             if self._failed > 2:
@@ -175,6 +185,7 @@ class Hand:
         """Photographs the specimen and plays the fringes; a capture in a new folder."""
         station, s = self._opened(), from_dict(settings)
         self.rest(call)
+        station.projector.release()  # after a cut it is dark, and may play fringes again
         r = store.read_rig(Path(rig))
         formats = {c.info.serial: c.info.pixel_formats[0] for c in station.cameras}
         plan = patterns.paper_plan(r, formats, s.patterns)
@@ -224,21 +235,17 @@ class Hand:
             if stored.surface is None:
                 raise CaptureError("the scan has no surface, so nothing was drawn on it; scan again")
             tissue = recipe.tissue_of(stored.grids, export.read_glb(stored.surface), r, s)
-            cache: dict[tuple[str, str], Any] = {}
 
-            def look(now: _Ready) -> Any:
-                masks = None
-                if now.pair is not None:
-                    if now.pair not in cache:
-                        cache.clear()
-                        cache[now.pair] = _masks(now.images[now.pair[0]], tissue)
-                    masks = cache[now.pair]
+            def look(masks: Any) -> Any:
                 return watching.watch(station, stored.grids, photos, r, s, noise=noise, masks=masks)
 
-            made = _Ready(station, scan_id, look, s, self._emit, self._cameras)
+            made = _Ready(station, scan_id, look, lambda image: _masks(image, tissue), s, self._emit, self._cameras)
+            self.live(call, station.cameras[0].info.serial, 320, 50)  # what is slow the first time is not so later
+            made.load(images)
             made.begin()
             self._ready = made
-        self._ready.images.update(images)
+        else:
+            self._ready.load(images)
         standing = self._ready.standing
         return {"guarded": True, "validity": None if standing is None else standing.value, "stop": self.stop_button()}
 
@@ -285,7 +292,7 @@ class Hand:
         at = time.time_ns()
         with self._cameras:
             frame = capturing.look([found], station.light, [fmt], Settings().capture)[0]
-        photo = fuse.photo(phase.unpacked(frame, fmt), fmt, camera, Settings().fuse).rgb
+        photo = fuse.encode_srgb(fuse.photo(phase.unpacked(frame, fmt), fmt, camera, Settings().fuse).rgb)
         if photo.shape[1] > width:
             size = width, max(1, round(photo.shape[0] * width / photo.shape[1]))
             photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)

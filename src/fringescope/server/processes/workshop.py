@@ -135,7 +135,7 @@ def photographs(call: Call, scan: str) -> dict[str, str]:
         call.check()
         photo = fuse.photo(picture.frame, picture.pixel_format, picture.camera, Settings().fuse)
         name = f"photo-{picture.camera}.jpg"
-        export_jpeg(Path(scan) / name, photo.rgb)
+        export_jpeg(Path(scan) / name, fuse.encode_srgb(photo.rgb))
         out[picture.camera] = name
     return out
 
