@@ -153,7 +153,7 @@ def _versions(doc: Mapping[str, Any], pictures: Mapping[str, U8]) -> list[Part]:
         for v in doc["versions"]
     ]  # fmt: skip
     head = ("No.", "By", "Since", "State", "Strokes", "Content")
-    out = [Part("Guidelines that were submitted", head=head, rows=rows, columns=(1, 4, 5, 6, 2, 5))]
+    out = [Part("Guidelines that were submitted", head=head, rows=rows, columns=(1.4, 3.6, 6, 6, 2.4, 5))]
     for v in doc["versions"]:
         lines = [f"Problem: {p}" for p in v["problems"][:20]]
         measured = [_stroke_row(m) for m in v["measured"][:_MOST_STROKES]]
@@ -196,7 +196,7 @@ def _comments(doc: Mapping[str, Any]) -> list[Part]:
         rows.append([when(c["at_ns"]), _name(doc, c["author"]), ", ".join(about), c["text"]])
     if not rows:
         return []
-    return [Part("Comments", head=("Time", "By", "About", "Words"), rows=rows, columns=(4, 4, 3, 9))]
+    return [Part("Comments", head=("Time", "By", "About", "Words"), rows=rows, columns=(5.5, 4, 3.5, 9))]
 
 
 def _signatures(doc: Mapping[str, Any]) -> list[Part]:

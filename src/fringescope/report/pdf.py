@@ -198,7 +198,8 @@ class _Pages:
 
     def part(self, p: Part) -> None:
         size = 14 if p.level == 0 else 12 if p.level == 1 else 10
-        self.need(22 if p.rows or p.lines else 80 if p.pictures else 22)
+        words = sum(len(wrapped(_clean(x), 9.5, ROOM)) * 4.8 + 1.5 for x in p.lines)
+        self.need(min(12 + words + (20 if p.rows else 75 if p.pictures else 0), 180))
         if self.y > TOP:
             self.y += 4 if p.level < 2 else 2
         self.text(p.title, size, True, after=2.0)

@@ -1,11 +1,11 @@
 """A case as one zip file that people and programs can use without a hub, and back in.
 
-    manifest.json     what it is, each file with its SHA-256, signed with the hub's key
-    events.jsonl      the log with its chain, an entry a line
-    report.pdf        for people
-    strokes/          guidelines files: one a version that was submitted, and the draft
-    scans/1/ ..       the folder of each scan: cloud.ply, surface.glb, surface.stl, photographs, grids
-    kept/OWNER/       what was made on the way: pictures for the projector, previews
+manifest.json     what it is, each file with its SHA-256, signed with the hub's key
+events.jsonl      the log with its chain, an entry a line
+report.pdf        for people
+strokes/          guidelines files: one a version that was submitted, and the draft
+scans/1/ ..       the folder of each scan: cloud.ply, surface.glb, surface.stl, photographs, grids
+kept/OWNER/       what was made on the way: pictures for the projector, previews
 """
 
 from __future__ import annotations
@@ -210,7 +210,11 @@ def _guidelines(values: Sequence[Mapping[str, Any]], scan: str, rig: str) -> dic
 
 
 def report_document(
-    g: Gathered, people: Mapping[str, Any], made_ns: int, patient: Patient | None, blobs: Blobs,
+    g: Gathered,
+    people: Mapping[str, Any],
+    made_ns: int,
+    patient: Patient | None,
+    blobs: Blobs,
     laid: Mapping[str, Path],
 ) -> dict[str, Any]:
     """What the report of a case tells, in plain values; files by their paths. `laid`: the folder of each scan."""
@@ -254,7 +258,7 @@ def _scan_part(s: ScanInfo, g: Gathered, strokes: Sequence[Mapping[str, Any]], f
         if (folder / f"photo-{camera}.jpg").is_file() and isinstance(size, list) and len(size) == 2 and min(size) > 0:
             pictures.append({"camera": camera, "file": str(folder / f"photo-{camera}.jpg"), "size": size,
                              "strokes": by_camera.get(str(camera), [])})  # fmt: skip
-        words += [f"{camera}: {w}" for w in view.get("words", ()) if isinstance(w, str)][:5]
+        words += [w for w in view.get("words", ()) if isinstance(w, str)][:5]
     measured = figures.get("specimen") if isinstance(figures, dict) else None
     return {
         "id": s.id, "label": s.label, "taken_ns": s.taken_ns, "words": words, "pictures": pictures, "world": world,

@@ -95,12 +95,7 @@ class Leaving:
             people = bundled.people_of(g, names)
             made_ns = self._hub.clock.now_ns()
             made = await asyncio.to_thread(self._prepare, g, folder, people, made_ns, patient)
-            try:
-                stl = await self._packer.call(
-                    "leave", asked=str(folder / "asked.json"), report_pdf=str(folder / bundled.REPORT)
-                )
-            finally:
-                await self._packer.kill()  # it holds what it has seen of the case
+            stl = await self._packed("leave", asked=str(folder / "asked.json"), report_pdf=str(folder / bundled.REPORT))
             made |= {f"scans/{Path(x).stem}/surface.stl": Path(x) for x in stl}
             made[bundled.REPORT] = folder / bundled.REPORT
             head = {"made_ns": made_ns, "people": people,
@@ -237,13 +232,18 @@ class Leaving:
                 return await self._instrument.keep(case, label, folder, doc, taken, present)
 
     async def _look_at(self, folder: Path, tell: Tell) -> dict[str, Any]:
-        try:
-            doc: dict[str, Any] = await self._packer.call(
-                "examine", lambda stage, share: tell(stage, 0.1 + 0.8 * share), folder=str(folder)
-            )
-        finally:
-            await self._packer.kill()
+        doc: dict[str, Any] = await self._packed(
+            "examine", lambda stage, share: tell(stage, 0.1 + 0.8 * share), folder=str(folder)
+        )
         return doc
+
+    async def _packed(self, name: str, tell: Tell | None = None, **args: Any) -> Any:
+        """Has the packer do something; it ends if nobody waits for it any more."""
+        try:
+            return await self._packer.call(name, tell, **args)
+        except asyncio.CancelledError:
+            await self._packer.kill()
+            raise
 
     def _unpack_scan(self, file: Path, to: Path) -> Path:
         with Unpacked(file, self._config.limits.upload_bytes, "the scan") as z:

@@ -25,8 +25,8 @@ class Unpacked:
     Use as a context manager. Raises FormatError for a file that is none, is damaged, or is made to do harm.
     """
 
-    def __init__(self, path: Path, most: int, what: str) -> None:
-        self.what = what
+    def __init__(self, path: Path, most: int, what: str, most_files: int = MOST_FILES) -> None:
+        self.what, self._most_files = what, most_files
         try:
             self._zip = zipfile.ZipFile(path)
         except _BROKEN as e:
@@ -45,8 +45,8 @@ class Unpacked:
 
     def _checked(self, most: int) -> Mapping[str, zipfile.ZipInfo]:
         infos = self._zip.infolist()
-        if len(infos) > MOST_FILES:
-            raise FormatError(f"{self.what}: {len(infos)} files; at most {MOST_FILES} are taken")
+        if len(infos) > self._most_files:
+            raise FormatError(f"{self.what}: {len(infos)} files; at most {self._most_files} are taken")
         total = sum(i.file_size for i in infos)
         if total > most:
             raise FormatError(f"{self.what}: {total} bytes when it is unpacked; at most {most} are taken")

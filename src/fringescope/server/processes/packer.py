@@ -12,6 +12,7 @@ import numpy as np
 from fringescope import export, report, store
 from fringescope.errors import FormatError, FringescopeError
 from fringescope.server.processes.child import Call
+from fringescope.settings import Settings
 from fringescope.types import U8
 
 _GRID = 200_000  #: places of a view among which that of a stroke is looked for
@@ -99,12 +100,22 @@ def examine(call: Call, folder: str) -> dict[str, Any]:
         export.read_glb(stored.surface)
     export.read_ply(stored.cloud)
     if any(p is not None for p in stored.pictures):
-        from fringescope.server.processes.workshop import photographs
-
         call.progress("photographs", 0.6)
-        photographs(call, folder)
+        photographs(call, stored)
     plain: dict[str, Any] = store.plain(doc)
     return plain
+
+
+def photographs(call: Call, stored: store.StoredScan) -> None:
+    """The photograph of each camera as JPEG beside a scan, where it keeps pictures."""
+    from fringescope import fuse
+
+    for picture in stored.pictures:
+        if picture is not None:
+            call.check()
+            photo = fuse.photo(picture.frame, picture.pixel_format, picture.camera, Settings().fuse)
+            data = export.encode_picture(fuse.encode_srgb(photo.rgb), 88)[0]
+            (stored.folder / f"photo-{picture.camera}.jpg").write_bytes(data)
 
 
 class Hand:
