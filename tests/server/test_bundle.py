@@ -186,6 +186,22 @@ def elsewhere(sign_in: SignIn) -> Client:
     return sign_in("operator")
 
 
+@pytest.fixture(scope="module")
+def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A hub into which nothing comes: what is tried there is refused."""
+    with Server(Config(tmp_path_factory.mktemp("untouched") / "hub", port=0), fast_passwords=True) as server:
+        populate(server)
+        yield server
+
+
+@pytest.fixture
+def doubtful(untouched: Server) -> Iterator[Client]:
+    """Its operator."""
+    untouched.site.logins._buckets.clear()
+    with Client(untouched.url, "operator", PASSWORD) as client:
+        yield client
+
+
 def test_it_comes_back_the_same(exported: dict[str, Any], elsewhere: Client, hub: Server, tmp_path: Path) -> None:
     case = elsewhere.import_case(exported["file"])
     assert case.id == exported["id"]
@@ -265,11 +281,11 @@ def altered(file: Path, to: Path, change: Callable[[dict[str, bytes]], Any], sig
     return to
 
 
-def refused(elsewhere: Client, file: Path) -> str:
+def refused(doubtful: Client, file: Path) -> str:
     with pytest.raises(HubError) as e:
-        elsewhere.import_case(file)
+        doubtful.import_case(file)
     assert e.value.status == 400, e.value
-    assert elsewhere.cases().total == 0
+    assert doubtful.cases().total == 0
     return str(e.value)
 
 
@@ -282,13 +298,13 @@ def flip(name: str) -> Callable[[dict[str, bytes]], None]:
     return change
 
 
-def test_one_bit_of_any_file_is_noticed(file: Path, elsewhere: Client, hub: Server, tmp_path: Path) -> None:
+def test_one_bit_of_any_file_is_noticed(file: Path, doubtful: Client, untouched: Server, tmp_path: Path) -> None:
     with zipfile.ZipFile(file) as z:
         names = z.namelist()
     for name in [*names[:: max(1, len(names) // 8)], "events.jsonl", "report.pdf", "scans/1/surface.glb"]:
         if name != "manifest.json":
-            assert "altered" in refused(elsewhere, altered(file, tmp_path / "x.zip", flip(name)))
-    assert not list((hub.config.data / "files").glob("??/*")), "nothing of them was kept"
+            assert "altered" in refused(doubtful, altered(file, tmp_path / "x.zip", flip(name)))
+    assert not list((untouched.config.data / "files").glob("??/*")), "nothing of them was kept"
 
 
 def in_manifest(**values: Any) -> Callable[[dict[str, bytes]], None]:
@@ -299,9 +315,9 @@ def in_manifest(**values: Any) -> Callable[[dict[str, bytes]], None]:
     return change
 
 
-def test_a_manifest_that_was_altered_or_is_of_another_kind(file: Path, elsewhere: Client, tmp_path: Path) -> None:
+def test_a_manifest_that_was_altered_or_is_of_another_kind(file: Path, doubtful: Client, tmp_path: Path) -> None:
     def tried(change: Callable[[dict[str, bytes]], Any], sign: bool = False) -> str:
-        return refused(elsewhere, altered(file, tmp_path / "x.zip", change, sign))
+        return refused(doubtful, altered(file, tmp_path / "x.zip", change, sign))
 
     assert "signature" in tried(in_manifest(made_ns=5))
     assert "higher than this program reads" in tried(in_manifest(version=2))
@@ -360,17 +376,17 @@ LOGS: dict[str, tuple[Callable[[list[dict[str, Any]]], Any], bool, str]] = {
 
 @pytest.mark.parametrize("what", LOGS)
 def test_a_log_that_was_altered_and_signed_anew(
-    file: Path, elsewhere: Client, hub: Server, tmp_path: Path, what: str
+    file: Path, doubtful: Client, untouched: Server, tmp_path: Path, what: str
 ) -> None:
     change, relink, words = LOGS[what]
-    assert words in refused(elsewhere, altered(file, tmp_path / "x.zip", in_log(change, relink), sign=True))
-    assert not list((hub.config.data / "files").glob("??/*")), "nothing of it was kept"
+    assert words in refused(doubtful, altered(file, tmp_path / "x.zip", in_log(change, relink), sign=True))
+    assert not list((untouched.config.data / "files").glob("??/*")), "nothing of it was kept"
 
 
 # ------------------------------------------------------------------------------------------------------- hostile zips
 
 
-def test_zips_that_are_made_to_do_harm(hub: Server, elsewhere: Client, tmp_path: Path) -> None:
+def test_zips_that_are_made_to_do_harm(untouched: Server, doubtful: Client, tmp_path: Path) -> None:
     def made(name: str, data: bytes = b"x", **info: Any) -> Path:
         with zipfile.ZipFile(tmp_path / "h.zip", "w", zipfile.ZIP_DEFLATED) as z:
             entry = zipfile.ZipInfo(name)
@@ -380,18 +396,18 @@ def test_zips_that_are_made_to_do_harm(hub: Server, elsewhere: Client, tmp_path:
         return tmp_path / "h.zip"
 
     for name in ("../out.txt", "/etc/x", "a/../../x", "C:/x", "a\\..\\x", "~/x", "a\x01b"):
-        assert "of the name" in refused(elsewhere, made(name)), name
-    assert "link" in refused(elsewhere, made("l", b"/etc/passwd", external_attr=0o120777 << 16))
+        assert "of the name" in refused(doubtful, made(name)), name
+    assert "link" in refused(doubtful, made("l", b"/etc/passwd", external_attr=0o120777 << 16))
     with zipfile.ZipFile(tmp_path / "h.zip", "w") as z:
         z.writestr("a", b"1")
         with pytest.warns(UserWarning, match="Duplicate"):
             z.writestr("a", b"2")
-    assert "two files of the name" in refused(elsewhere, tmp_path / "h.zip")
+    assert "two files of the name" in refused(doubtful, tmp_path / "h.zip")
     for junk in (b"", b"PK\x03\x04", b"no zip at all" * 100, (tmp_path / "h.zip").read_bytes()[:-30]):
         (tmp_path / "j.zip").write_bytes(junk)
-        assert "no zip file" in refused(elsewhere, tmp_path / "j.zip")
+        assert "no zip file" in refused(doubtful, tmp_path / "j.zip")
     assert not list(tmp_path.parent.glob("out.txt"))
-    assert not list((hub.config.data / "work").glob("*"))
+    assert not list((untouched.config.data / "work").glob("*"))
 
 
 def test_a_zip_bomb_and_a_bundle_that_is_too_large(tmp_path: Path, file: Path) -> None:

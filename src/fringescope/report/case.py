@@ -14,7 +14,7 @@ from fringescope.report.pdf import Part, Shown, write_pdf
 from fringescope.types import U8
 
 NOTICE = "Research use only. Not a medical device; not for diagnosis or treatment."
-_DRAWN_AT = 1400  #: pixels: a picture is made this wide at most before strokes are drawn on it
+_DRAWN_AT = 1000, 1400  #: pixels: a picture is made this wide, least and most, before strokes are drawn on it
 _MOST_STROKES = 60  #: that have a line of their own in a table
 
 
@@ -108,11 +108,12 @@ def _measured(said: Mapping[str, Any]) -> list[list[str]]:
 def drawn(picture: U8, strokes: Sequence[Mapping[str, Any]], size: Sequence[int]) -> U8:
     """A photograph with strokes on it; their pixels are those of a camera of `size` (width, height)."""
     h, w = picture.shape[:2]
-    k = min(1.0, _DRAWN_AT / w)
-    out = cv2.resize(picture, (max(1, round(w * k)), max(1, round(h * k))), interpolation=cv2.INTER_AREA)
+    k = min(max(1.0, _DRAWN_AT[0] / w), _DRAWN_AT[1] / w)
+    how = cv2.INTER_AREA if k < 1 else cv2.INTER_CUBIC
+    out = cv2.resize(picture, (max(1, round(w * k)), max(1, round(h * k))), interpolation=how)
     out = np.ascontiguousarray(out)
     per = np.array([out.shape[1] / size[0], out.shape[0] / size[1]])
-    wide = max(1, round(out.shape[1] / 500))
+    wide = max(1, round(out.shape[1] / 450))
     for s in strokes:
         at = (np.asarray(s["pixels"], np.float64).reshape(-1, 2) + 0.5) * per - 0.5
         at = np.clip(at, -1e4, 1e4)
@@ -129,7 +130,7 @@ def drawn(picture: U8, strokes: Sequence[Mapping[str, Any]], size: Sequence[int]
                 cv2.polylines(out, [points], closed, colour, wide + more, cv2.LINE_AA)
         words = str(s.get("text") or s.get("id", ""))[:24].encode("ascii", "replace").decode()
         where = (int(points[0, 0]) + 4 * wide, int(points[0, 1]) - 4 * wide)
-        scale = out.shape[1] / 1500
+        scale = out.shape[1] / 1400
         for colour, more in (((0, 0, 0), 2), (rgb, 0)):
             cv2.putText(out, words, where, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, wide + more, cv2.LINE_AA)
     return np.asarray(out, np.uint8)
@@ -149,7 +150,7 @@ def _versions(doc: Mapping[str, Any], pictures: Mapping[str, U8]) -> list[Part]:
         return [Part("Guidelines", ["None was submitted."])]
     rows = [
         [str(v["number"]), _name(doc, v["author"]), when(v["since_ns"]),
-         v["phase"] + (f": {v['why']}" if v["why"] else ""), str(v["strokes"]), f"{v['content'][:16]}…"]
+         v["phase"] + (f": {v['why']}" if v["why"] else ""), str(v["strokes"]), f"{v['content'][:12]}…"]
         for v in doc["versions"]
     ]  # fmt: skip
     head = ("No.", "By", "Since", "State", "Strokes", "Content")
