@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -145,12 +146,17 @@ def _name(doc: Mapping[str, Any], person: str) -> str:
     return str(doc["people"].get(person, {}).get("name") or person)
 
 
+def _named(doc: Mapping[str, Any], text: str) -> str:
+    """A sentence with names in the place of identifiers."""
+    return re.sub(r"person-[0-9a-f]{20}", lambda m: _name(doc, m.group()), text)
+
+
 def _versions(doc: Mapping[str, Any], pictures: Mapping[str, U8]) -> list[Part]:
     if not doc["versions"]:
         return [Part("Guidelines", ["None was submitted."])]
     rows = [
         [str(v["number"]), _name(doc, v["author"]), when(v["since_ns"]),
-         v["phase"] + (f": {v['why']}" if v["why"] else ""), str(v["strokes"]), f"{v['content'][:12]}…"]
+         v["phase"] + (f": {_named(doc, v['why'])}" if v["why"] else ""), str(v["strokes"]), f"{v['content'][:12]}…"]
         for v in doc["versions"]
     ]  # fmt: skip
     head = ("No.", "By", "Since", "State", "Strokes", "Content")
@@ -161,14 +167,20 @@ def _versions(doc: Mapping[str, Any], pictures: Mapping[str, U8]) -> list[Part]:
         if (more := len(v["measured"]) - _MOST_STROKES) > 0:
             lines.append(f"And {more} strokes more, in the file of version {v['number']}.")
         shown = [
-            Shown(pictures[f], f"version {v['number']}, as it is projected: {c}")
-            for c, f in v["previews"]
+            Shown(pictures[f], f"version {v['number']}, as it is projected: {of}")
+            for of, f in v["previews"]
+            if f in pictures
+        ]
+        shown += [
+            Shown(pictures[f], f"projected on the specimen, {when(at)}: {of}")
+            for of, f, at in v["shown"]
             if f in pictures
         ]
         if lines or measured or shown:
             out.append(
                 Part(f"Version {v['number']}", lines, ("Stroke", "Length", "Area", "Expected error", "Visible"),
-                     measured, (4, 4, 4, 3, 2), shown, 1 + (len(shown) > 1), 2)
+                     measured, (4, 4, 4, 3, 2), shown,
+                     min(3, max(1, len(shown))), 2)
             )  # fmt: skip
     return out
 

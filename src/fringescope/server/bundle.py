@@ -40,6 +40,7 @@ MANIFEST, EVENTS, REPORT = "manifest.json", "events.jsonl", "report.pdf"
 _LONGEST = 64 << 20  #: of the manifest
 _ENTRY = 8 << 20  #: of one entry of the log
 _PIECE = 1 << 20
+_SHOWN = 9  #: photographs of a projection in the report, the latest
 _SMALL = (".json", ".jsonl")  #: what is worth compressing
 
 Hex = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -142,6 +143,7 @@ class Gathered:
     brought: Mapping[str, Any]  #: people that an earlier bundle named
     scans: Sequence[ScanInfo]
     kept: Mapping[str, Sequence[ScanFile]]  #: other files, by owner
+    shown: Sequence[Mapping[str, Any]] = ()  #: what was photographed while it was projected
 
 
 # ------------------------------------------------------------------------------------------------------------ leaving
@@ -152,6 +154,7 @@ def gather(engine: sa.Engine, case: Case, log: Path, settings: ExaminationSettin
     now, seq, head, opened = truth.Truth(), 0, GENESIS, 0
     actors: dict[str, str] = {}
     brought: dict[str, Any] = {}
+    shown = []
     with log.open("wb") as out:
         for r in journal.entries(engine, case.id):
             if r.payload is None or r.kind == "erased":
@@ -163,6 +166,8 @@ def gather(engine: sa.Engine, case: Case, log: Path, settings: ExaminationSettin
             actors.setdefault(r.actor, r.role)
             if r.kind == "imported":
                 brought |= r.payload.get("people", {})
+            elif r.kind == "evidence" and not r.refused and isinstance(r.payload.get("pictures"), dict):
+                shown.append(r.payload)
     if not seq:
         raise UsageError(f"case {case.id} has no log")
     files = cases.files_of(engine, case.id)
@@ -174,7 +179,7 @@ def gather(engine: sa.Engine, case: Case, log: Path, settings: ExaminationSettin
         if owner not in taken and not (owner.startswith("version-") and owner[8:] not in map(str, known))
         and not owner.startswith("sha256:")
     }  # fmt: skip
-    return Gathered(case, now, seq, head, opened, actors, brought, scans, kept)
+    return Gathered(case, now, seq, head, opened, actors, brought, scans, kept, shown)
 
 
 def people_of(g: Gathered, names: Mapping[str, str]) -> dict[str, dict[str, str]]:
@@ -274,10 +279,16 @@ def _version_part(v: Any, g: Gathered, blobs: Blobs) -> dict[str, Any]:
             measured = json.loads(record.read_text())["strokes"]
         except (OSError, ValueError, KeyError, TypeError):
             measured = []
+    known = {f.sha256 for found in g.kept.values() for f in found}
+    taken = [
+        (Path(name).stem, str(blobs.path(sha256)), x.get("shown_ns")) for x in g.shown if x.get("version") == v.number
+        for name, sha256 in sorted(x["pictures"].items()) if sha256 in known
+    ]  # fmt: skip
     previews = [(n[8:-4], str(p)) for n, p in files.items() if n.startswith("preview-") and n.endswith(".jpg")]
     return {
         "number": v.number, "author": v.author, "phase": v.phase.value, "why": v.why, "content": v.content,
         "since_ns": v.since_ns, "strokes": len(v.strokes), "problems": list(v.problems), "previews": sorted(previews),
+        "shown": taken[-_SHOWN:],
         "measured": [m for m in measured if isinstance(m, dict)],
     }  # fmt: skip
 

@@ -288,9 +288,11 @@ class Instrument:
         told = {"version": effect.version, "pattern": effect.pattern, "shown_ns": shown_ns,
                 "pictures": {f.name: f.sha256 for f in files}}  # fmt: skip
         owner = f"evidence-{shown_ns}"
-        await self._hub.note(
+        said = await self._hub.note(
             case, INSTRUMENT, INSTRUMENT, "evidence", told, lambda c: cases.insert_files(c, case, owner, files)
         )
+        if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
 
     # ----------------------------------------------------------------------------------------------------- what it says
 

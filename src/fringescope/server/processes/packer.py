@@ -43,7 +43,7 @@ def _pictures(told: dict[str, Any]) -> dict[str, U8]:
     import cv2
 
     names = {p["file"] for s in told["scans"] for p in s["pictures"]}
-    names |= {f for v in told["versions"] for _, f in v["previews"]}
+    names |= {x[1] for v in told["versions"] for x in (*v["previews"], *v["shown"])}
     out = {}
     for name in names:
         image = cv2.imread(name, cv2.IMREAD_COLOR)
