@@ -48,6 +48,24 @@ def a_full_case(operator: Client, expert: Client, scan: Path) -> HubCase:
     return case
 
 
+def photographed(server: Server, case: HubCase) -> None:
+    """As if version 1 had been projected: the instrument's photograph of it goes into the case."""
+    import asyncio
+
+    from fringescope.server import cases
+    from fringescope.wire import ScanFile
+
+    photo = next(f for f in case.scans()[0].files if f.name == "photo-camera1.jpg")
+    files = [ScanFile(name="camera1.jpg", sha256=photo.sha256, size=photo.size, type="image/jpeg")]
+    word = {"version": 1, "pattern": "p", "shown_ns": 1_700_000_000 * 10**9, "pictures": {"camera1.jpg": photo.sha256}}
+    assert server.loop is not None
+    noted = server.site.hub.note(
+        case.id, "instrument", "instrument", "evidence", word,
+        lambda c: cases.insert_files(c, case.id, "evidence-1700000000000000000", files),
+    )  # fmt: skip
+    assert not asyncio.run_coroutine_threadsafe(noted, server.loop).result(10).refused
+
+
 @pytest.fixture(scope="module")
 def exported(scan_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """A bundle, and what its hub says of the case."""
@@ -56,6 +74,7 @@ def exported(scan_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
         populate(server)
         with Client(server.url, "operator", PASSWORD) as operator, Client(server.url, "expert", PASSWORD) as expert:
             case = a_full_case(operator, expert, scan_folder)
+            photographed(server, case)
             told = {"file": case.bundle(at / "bundle.zip"), "state": case.state(), "case": case.get(), "at": at,
                     "events": case.events(), "scans": case.scans(), "hub": server, "id": case.id}  # fmt: skip
             told["named"] = case.bundle(at / "named.zip", patient=True)
@@ -164,6 +183,7 @@ def test_the_report_tells_all_of_it(file: Path, tmp_path: Path, exported: dict[s
         "S26-4711", "T-17", "tongue", "two stitches at 12 h", "before the cut",
         f"{specimen['volume_mm3']:.1f} mm³", f"± {specimen['volume_sigma_mm3']:.1f} mm³",
         f"{specimen['length_mm']:.2f} mm", "is the margin wide enough here?", "yes: 5 mm, I would say",
+        "projected on the specimen, 2023-11-14 22:13:20 UTC: camera1",
         "approved, version 1", "proposed, version 1", exported["case"].id,
     ]  # fmt: skip
     for words in told:

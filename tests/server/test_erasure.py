@@ -249,3 +249,36 @@ def test_what_is_projected_is_stopped_first(
         sign_in("admin").case(told.id).erase("asked for")
     assert e.value.status == 409
     assert told.state().strokes
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_an_erasure_that_was_killed_is_ended_by_the_next_start(
+    hub: Server, told: HubCase, sign_in: SignIn, monkeypatch: pytest.MonkeyPatch, written: bool
+) -> None:  # fmt: skip
+    """Killed behind the event, before the files went; or before the event: then it did not happen."""
+    from fringescope.errors import OutputError
+    from fringescope.server import leaving
+
+    data = hub.config.data
+    sha256 = with_file(hub, told, "own.json", b'"a mole like a heart"')
+
+    def killed(*_args: object, **_more: object) -> None:
+        raise OutputError("killed")
+
+    with monkeypatch.context() as m:
+        if written:
+            m.setattr(leaving, "sweep", killed)
+        else:
+            m.setattr(hub.site.hub, "note", killed)
+        with pytest.raises(HubError, match="killed"):
+            sign_in("admin").case(told.id).erase("asked for")
+    assert list(data.glob("erasing-*"))
+    assert hub.site.blobs.has(sha256)
+    hub.close()
+    with Server(hub.config, fast_passwords=True) as second:
+        assert second.site.blobs.has(sha256) is not written
+        with Client(second.url, "operator", PASSWORD) as again:
+            assert again.case(told.id).get().status.value == ("erased" if written else "open")
+    assert not list(data.glob("erasing-*"))
+    assert (on_disk(data) == {}) is written
+    assert judged(data).faults == ()

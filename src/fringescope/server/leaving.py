@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import datetime
 import json
+import os
 import secrets
 import shutil
 import tempfile
@@ -39,6 +40,7 @@ from fringescope.wire.documents import Patient
 
 _SPARE = 256 << 20  #: bytes of the disk that must stay free
 _BATCH = 500
+_ERASING = "erasing-"  #: a file of the hub's folder while a case is erased: what has to go
 
 
 class HereAlreadyError(UsageError):
@@ -275,15 +277,17 @@ class Leaving:
             guests = await asyncio.to_thread(self._guests, case)
             await self._instrument.forget(case)
             at = self._hub.clock.now_ns()
+            hashes = [f.sha256 for found in files.values() for f in found]
+            await asyncio.to_thread(_note_down, self._config.data, case, hashes)  # for who comes after a power cut
             said = await self._hub.note(
                 case, person, role, "erased", {"why": why}, after=lambda c: cases.erase(c, case, at)
             )
             if said.refused:
+                (self._config.data / f"{_ERASING}{case}.json").unlink(missing_ok=True)
                 raise UsageError(said.refused) if said.seq else OutputError(said.refused)
             self._hub.rooms.close(case, ERASED)
             self._hub.forget(case)
-            hashes = [f.sha256 for found in files.values() for f in found]
-            gone = await asyncio.to_thread(self._sweep, case, hashes)
+            gone = await asyncio.to_thread(sweep, self._config.data, self._hub.engine, self._blobs, case, hashes)
             for guest in guests:
                 await asyncio.to_thread(self._accounts.change, guest, disabled=True)
         return {"events": (said.seq or 1) - 1, "files": gone}
@@ -293,11 +297,39 @@ class Leaving:
             asked = sa.select(db.people.c.id).where(db.people.c.case_id == case, sa.not_(db.people.c.disabled))
             return [r.id for r in c.execute(asked)]
 
-    def _sweep(self, case: str, hashes: list[str]) -> int:
-        gone = cases.drop_files(self._hub.engine, self._blobs, hashes)
-        shutil.rmtree(self._config.data / cases.LAID_OUT / case, ignore_errors=True)
-        db.forget_erased(self._hub.engine)
-        return gone
+
+def _note_down(data: Path, case: str, hashes: list[str]) -> None:
+    file = data / f"{_ERASING}{case}.json"
+    try:
+        with file.open("w") as out:
+            json.dump(hashes, out)
+            out.flush()
+            os.fsync(out.fileno())
+    except OSError as e:
+        raise OutputError(f"{file}: {e.strerror}; nothing was erased") from e
+
+
+def sweep(data: Path, engine: sa.Engine, blobs: Blobs, case: str, hashes: list[str]) -> int:
+    """Takes away the files of a case that was erased; how many."""
+    gone = cases.drop_files(engine, blobs, hashes)
+    shutil.rmtree(data / cases.LAID_OUT / case, ignore_errors=True)
+    db.forget_erased(engine)
+    (data / f"{_ERASING}{case}.json").unlink(missing_ok=True)
+    return gone
+
+
+def finish_erasures(data: Path, engine: sa.Engine, blobs: Blobs) -> None:
+    """Ends the erasures in the middle of which a hub was killed: those whose event was written."""
+    for file in data.glob(f"{_ERASING}*.json"):
+        case = file.stem[len(_ERASING) :]
+        try:
+            hashes = [str(h) for h in json.loads(file.read_text())]
+        except (OSError, ValueError, TypeError):
+            hashes = []  # it was killed while it wrote this down, before anything was erased
+        if cases.is_erased(engine, case):
+            sweep(data, engine, blobs, case, hashes)
+        else:
+            file.unlink(missing_ok=True)
 
 
 def _time_of(created: Any) -> int | None:

@@ -22,7 +22,7 @@ from fringescope.server.hub import Hub
 from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
-from fringescope.server.leaving import Leaving
+from fringescope.server.leaving import Leaving, finish_erasures
 from fringescope.server.rooms import Rooms
 from fringescope.server.throttle import Throttle
 
@@ -85,6 +85,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         clock = Clock(journal.last_ns(engine))
         blobs = Blobs(config.data / "files")
+        finish_erasures(config.data, engine, blobs)
         limits = config.limits
         accounts = Accounts(engine, clock, limits, hasher)
         rooms = Rooms(limits.waiting)

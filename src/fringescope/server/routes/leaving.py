@@ -12,9 +12,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import FileResponse
-from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
+from starlette.types import Receive, Scope, Send
 
 from fringescope.errors import FormatError, FringescopeError, UsageError
 from fringescope.server import cases as kept
@@ -59,10 +59,17 @@ async def bundle(
             raise HTTPException(410, str(e)) from None
         raise
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", found.specimen.pseudonym or found.accession).strip("-.") or "case"
-    return FileResponse(
-        file, media_type=ZIP, filename=f"{name[:60]}-{case[-6:]}.zip",
-        background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
-    )  # fmt: skip
+    return _Passing(file, media_type=ZIP, filename=f"{name[:60]}-{case[-6:]}.zip")
+
+
+class _Passing(FileResponse):
+    """A file whose folder goes when it was sent, or when nobody takes it."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            shutil.rmtree(Path(self.path).parent, ignore_errors=True)
 
 
 def _work(who: Who) -> Path:
