@@ -122,6 +122,53 @@ def test_any_column_altered_is_found(folder: Path, table: str, column: str) -> N
     assert alone, "found without checkpoints, too"
 
 
+@pytest.mark.verify
+@pytest.mark.parametrize(("table", "column"), COLUMNS)
+def test_any_column_of_any_event_altered_is_found(folder: Path, table: str, column: str) -> None:
+    case = a_case(folder)
+    kind = {c.name: c.type for c in (db.events if table == "events" else db.payloads).columns}[column]
+    for seq in range(1, 12):
+        at = f"WHERE case_id = '{case}' AND seq = {seq}"
+        with closing(sqlite3.connect(folder / "hub.sqlite")) as c:
+            before = c.execute(f"SELECT {column} FROM {table} {at}").fetchone()[0]
+        value: Any = f"{column} + 100000" if isinstance(kind, sa.BigInteger) else f"{column} || ' '"
+        if column == "body":
+            value = "replace(body, '{', '{\"x\": 1, ')" if before != "{}" else "'{\"x\": 1}'"
+        if column == "seq":
+            value = 500
+        assert by_hand(folder, f"UPDATE {table} SET {column} = {value} {at}") == 1
+        assert any(case in f for f in judged(folder).faults), seq
+        moved = f"WHERE case_id = '{case}' AND seq = 500" if column == "seq" else at
+        moved = f"WHERE case_id = '{case} ' AND seq = {seq}" if column == "case_id" else moved
+        assert by_hand(folder, f"UPDATE {table} SET {column} = :before {moved}", before=before) == 1
+        assert judged(folder).whole
+
+
+def test_a_checkpoint_on_a_full_disk_is_written_whole_or_not(
+    hub: Server, sign_in: SignIn, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    import os
+
+    from fringescope.errors import OutputError
+
+    case = scanned(hub, sign_in("operator"))
+    hub.site.checkpoints.write()
+    before = the_file(hub.config.data).read_bytes()
+    case.change(status="done")
+
+    def full(_number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as m:
+        m.setattr(os, "fsync", full)
+        with pytest.raises(OutputError, match="No space left"):
+            hub.site.checkpoints.write()
+    assert the_file(hub.config.data).read_bytes() == before
+    hub.site.checkpoints.write()
+    assert len(the_file(hub.config.data).read_text().splitlines()) == 2
+    assert judged(hub.config.data).whole
+
+
 @pytest.mark.parametrize("value", ["'abc'", "NULL", "x'ff'", "1e300", "-1"])
 def test_values_of_another_kind_are_found_and_break_nothing(folder: Path, value: str) -> None:
     case = a_case(folder)

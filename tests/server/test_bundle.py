@@ -528,3 +528,85 @@ def test_what_is_no_scan_does_not_come_in(elsewhere: Client, scan_folder: Path, 
     assert "sha256:" in tried(doc(hash="../../etc"))
     assert case.get().seq == before
     assert case.scans() == []
+
+
+# ------------------------------------------------------------------------------------------------- what goes wrong
+
+
+def left_over(hub: Server) -> list[Path]:
+    """What lies in the hub's folder for work, once it had time to tidy up."""
+    import time
+
+    end = time.monotonic() + 10
+    work = hub.config.data / "work"
+    while list(work.glob("*")) and time.monotonic() < end:
+        time.sleep(0.02)
+    return list(work.glob("*"))
+
+
+def raw(hub: Server, client: Client, head: str, body: bytes = b"") -> Any:
+    """A request by hand, of which the rest never comes."""
+    import socket
+
+    port = int(hub.url.rsplit(":", 1)[1])
+    made = socket.create_connection(("127.0.0.1", port), timeout=10)
+    cookie = f"fringescope={client.http.cookies['fringescope']}"
+    lines = f"{head} HTTP/1.1\r\nhost: 127.0.0.1:{port}\r\ncookie: {cookie}\r\nx-csrf-token: {client.me.csrf}\r\n"
+    made.sendall(lines.encode() + (f"content-length: {10 * len(body)}\r\n" if body else "").encode() + b"\r\n" + body)
+    return made
+
+
+def test_an_upload_that_breaks_off_leaves_nothing(hub: Server, elsewhere: Client, file: Path) -> None:
+    import time
+
+    with raw(hub, elsewhere, "POST /api/cases/import", file.read_bytes()[:200_000]):
+        end = time.monotonic() + 10
+        while not list((hub.config.data / "work").glob("upload-*")) and time.monotonic() < end:
+            time.sleep(0.01)
+        assert list((hub.config.data / "work").glob("upload-*"))
+    assert not left_over(hub)
+    assert elsewhere.cases().total == 0
+    assert elsewhere.import_case(file).get().scans == 1, "the hub goes on"
+
+
+def test_a_download_that_nobody_takes_leaves_nothing(exported: dict[str, Any]) -> None:
+    hub = exported["hub"]
+    with Client(hub.url, "operator", PASSWORD) as operator:
+        made = raw(hub, operator, f"GET /api/cases/{exported['id']}/bundle")
+        assert made.recv(20).startswith(b"HTTP/1.1 200")
+        made.close()
+    assert not left_over(hub)
+
+
+def test_a_full_disk_is_told_before_anything_is_kept(
+    hub: Server, elsewhere: Client, file: Path, scan_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:  # fmt: skip
+    case = elsewhere.import_case(file)
+    blobs = len(list((hub.config.data / "files").glob("??/*")))
+    monkeypatch.setattr(hub.site.blobs, "free_bytes", lambda: 1000)
+    for attempt in (
+        lambda: elsewhere.import_case(file),
+        lambda: case.bundle(tmp_path / "x.zip"),
+        lambda: case.add_scan(scan_folder),
+    ):
+        with pytest.raises(HubError, match="1000 bytes left") as e:
+            attempt()
+        assert e.value.status == 507
+    assert len(list((hub.config.data / "files").glob("??/*"))) == blobs
+    assert not left_over(hub)
+
+
+def test_a_file_that_was_damaged_on_the_hubs_disk_does_not_leave_unseen(
+    hub: Server, elsewhere: Client, file: Path, tmp_path: Path
+) -> None:  # fmt: skip
+    case = elsewhere.import_case(file)
+    cloud = next(f for f in case.scans()[0].files if f.name == "cloud.ply")
+    path = hub.site.blobs.path(cloud.sha256)
+    path.chmod(0o640)
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.unlink()  # the folder that is laid out shares the content
+    path.write_bytes(data)
+    with pytest.raises(HubError, match=r"cloud\.ply .* damaged on the hub's disk"):
+        case.bundle(tmp_path / "x.zip")
+    assert not (tmp_path / "x.zip").exists()

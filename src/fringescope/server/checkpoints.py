@@ -189,23 +189,20 @@ class Checkpoints:
 
 def _append(file: Path, line: bytes) -> None:
     """A line at the end of a file, whole or not at all; what a power cut left of another goes."""
-    number = os.open(file, os.O_RDWR | os.O_CREAT, 0o640)
-    try:
-        end = os.lseek(number, 0, os.SEEK_END)
-        while end and os.pread(number, 1, end - 1) != b"\n":
+    with os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT, 0o640), "r+b", buffering=0) as out:
+        end = out.seek(0, os.SEEK_END)
+        while end and (out.seek(end - 1), out.read(1))[1] != b"\n":
             end -= 1
-        os.ftruncate(number, end)
-        os.lseek(number, end, os.SEEK_SET)
+        out.truncate(end)
+        out.seek(end)
         try:
             left = line
             while left:
-                left = left[os.write(number, left) :]
-            os.fsync(number)
+                left = left[out.write(left) or 0 :]
+            os.fsync(out.fileno())
         except OSError:
-            os.ftruncate(number, end)
+            out.truncate(end)
             raise
-    finally:
-        os.close(number)
 
 
 def _document(now: int, heads: Heads, whole: bool, prev: str) -> dict[str, Any]:
