@@ -33,6 +33,13 @@ export interface AskedCarry {
   version: number;
 }
 
+/** Two scans of a case, and the version whose lines the cut should have followed. */
+export interface AskedCompare {
+  before: string;
+  after: string;
+  version?: number | null;
+}
+
 /** A case to erase, and why: a request, a rule, the end of a study. */
 export interface AskedErasure {
   why: string;
@@ -233,6 +240,11 @@ export interface NewPerson {
   name: string;
   password: string;
   role: PersonRole;
+}
+
+/** A pose of the calibration board; the first of a session says which board it is, as its board.json does. */
+export interface NewPose {
+  board?: Record<string, unknown> | null;
 }
 
 /** A scan to take. */

@@ -57,12 +57,15 @@ def kept(hub: Server, sign_in: SignIn) -> HubCase:
 @pytest.mark.parametrize("name", ["kept.zip", "kept"])
 def test_all_of_it_comes_back(hub: Server, kept: HubCase, tmp_path: Path, name: str) -> None:
     state, events, got = kept.state(), kept.events(), kept.get()
+    (hub.config.data / "rigs").mkdir(exist_ok=True)
+    (hub.config.data / "rigs" / "some.json").write_text("{}")
     made = backup.back_up(hub.config.data, tmp_path / "elsewhere" / name)
     assert (made.files, made.new, made.damaged) == (2, 2, [])
     kept.change(status="done")  # after the backup
     found = backup.restore(tmp_path / "elsewhere" / name, tmp_path / "restored")
     assert (found.faults, found.missing, found.files) == ((), [], 2)
     assert judged(tmp_path / "restored", files=True).whole
+    assert (tmp_path / "restored" / "rigs" / "some.json").read_text() == "{}"
     with Server(Config(tmp_path / "restored", port=0), fast_passwords=True) as second:
         with Client(second.url, "operator", PASSWORD) as again:
             case = again.case(kept.id)

@@ -205,6 +205,44 @@ def test_a_scan_can_be_cancelled_and_leaves_nothing(case: HubCase, operator: Cli
     assert len(case.scans()) == before
 
 
+def test_two_scans_are_compared(case: HubCase) -> None:
+    first, second = case.scans()[:2]
+    job = case.compare(first.id, second.id)
+    assert job.result is not None
+    assert 0.7 < abs(job.result["registration"]["shift_mm"]) < 0.9
+    assert job.result["change"]["removed_mm3"] < 3.0
+    files = case.hub.ask("GET", f"/api/cases/{case.id}/files")[job.result["owner"]]
+    assert {"compare.json", "map.png", "cloud.ply"} <= {f["name"] for f in files}
+
+
+def test_a_calibration_begins_with_its_board(operator: Client) -> None:
+    with pytest.raises(HubError, match="no board was photographed"):
+        operator.calibrate()
+    with pytest.raises(HubError, match="say which board"):
+        operator.pose()
+    with pytest.raises(HubError, match="inner_corners"):
+        operator.pose({"pattern": "checkerboard", "square_mm": 5.0})
+
+
+@pytest.mark.verify
+@pytest.mark.timeout(1800)
+def test_the_instrument_is_calibrated_from_here(operator: Client, case: HubCase) -> None:
+    board = {"pattern": "checkerboard", "inner_corners": [11, 8], "square_mm": 5.0}
+    rig = case.state().standing["rig"]
+    for pose in range(8):
+        operator.befall(scene="board", pose=str(pose))
+        operator.pose(board if pose == 0 else None)
+    found = operator.calibrate().result
+    assert found is not None
+    assert found["rig"] != rig
+    assert found["selftest"]["ok"], found["selftest"]
+    operator.befall(scene="tissue-domed")
+    scan = case.scan("with the new rig").result
+    assert scan is not None
+    assert case.state().standing["rig"] == found["rig"]
+    assert all(v["phase"] in ("stale", "superseded") for v in case.state().standing["versions"])
+
+
 def test_live_pictures_tell_their_scan(bench: Server, case: HubCase) -> None:
     import json
 

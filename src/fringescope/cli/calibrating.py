@@ -149,26 +149,66 @@ def calibrate(
     report: Annotated[
         Path | None, typer.Option(help="The report, a page for any browser; else beside the rig, as RIG.html.")
     ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="URI", help="The instrument, with the board still under it: a cross grid is shown, too."),
+    ] = None,
     response: ResponseFile = None,
     settings: SettingsFile = None,
     set_: SetOption = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Board captures to a calibrated rig, with the evidence to trust it."""
+    """Board captures to a calibrated rig, with the evidence to trust it.
+
+    With --device the self-test follows: status 1 if the lines of a cross grid land too far from where they should.
+    """
     from fringescope import calibrate as calibrate_
-    from fringescope import pipeline, store
-    from fringescope import report as report_
 
     s = load_settings(settings, set_)
     calibrate_.check(s.calibrate)
     existing(session, "a session: a folder with board.json and a capture per pose")
-    title = _title(session.resolve())
     page = report if report is not None else out.with_suffix(".html")
     if page.resolve() == out.resolve():
         raise UsageError(f"--report {page} is the rig itself; name another file")
+    with Progress() as progress:
+        c, evidence, why = calibrate_into(out, page, session, s, progress, load_response(response), force=force)
+        told, lines = _told(c, evidence, why, out, page), _lines(c, evidence, why, out, page)
+        landed = None if device is None else progress.run("self-test", lambda: cross_grid(device, out, s))
+    if landed is not None:
+        told["selftest"] = landed
+        lines.append(landed["words"])
+    emit(told, json, lines)
+    if landed is not None and not landed["ok"]:
+        raise typer.Exit(1)
+
+
+def cross_grid(device: str, rig: Path, s: Settings) -> dict[str, Any]:
+    """Projects a cross grid on the board under an instrument and measures it: the figures, and a line for people."""
+    from fringescope import store
+    from fringescope.devices import registry
+    from fringescope.pipeline.selftest import self_test
+
+    with registry.open_station(device) as station:
+        found = self_test(station, store.read_rig(rig), s)
+    figures = {"median_um": found.median_um, "p95_um": found.p95_um, "max_um": found.max_um, "ok": found.ok}
+    return {**figures, "limit_um": s.loop.accept_um, "words": found.words(s.loop.accept_um)}
+
+
+def calibrate_into(
+    out: Path, page: Path, session: Path, s: Settings, progress: Progress, response: Response | None = None, *,
+    force: bool = False,
+) -> tuple[Calibration, Evidence, list[str]]:  # fmt: skip
+    """Calibrates a session and writes the rig and its report; returns both, and why pictures were not used.
+
+    Raises CalibrationError where there is no rig; the report, which says why, is written all the same.
+    """
+    from fringescope import pipeline, store
+    from fringescope import report as report_
+
+    title = _title(session.resolve())
     looked, failure = Looked(), ""
-    with Progress() as progress, store.new_file(page, force=force) as page_file:
+    with store.new_file(page, force=force) as page_file:
         try:
             with store.new_file(out, force=force) as rig_file:
                 if session.is_file():
@@ -176,7 +216,7 @@ def calibrate(
                 else:
                     found = store.read_session(session)
                     board, sizes = found.board, _sizes(found)
-                    looked = look(found, s, progress, load_response(response))
+                    looked = look(found, s, progress, response)
                 why = [f"{name}: {why}" for name, why in looked.wrong.items()]
                 c, evidence = pipeline.calibrate_rig(looked.seen, board, sizes, s, progress.share, why)
                 store.write_json(rig_file, store.rig_document(rig_with_evidence(c, evidence, s)))
@@ -194,7 +234,7 @@ def calibrate(
             page_file.write_text(text, encoding="utf-8")
     if failure:
         raise CalibrationError(f"{failure}; see {page}")
-    emit(_told(c, evidence, why, out, page), json, _lines(c, evidence, why, out, page))
+    return c, evidence, why
 
 
 def _title(session: Path) -> str:

@@ -262,8 +262,6 @@ def selftest(
         store.write_json(tmp / "selftest.json", store.plain(told))
         for camera, picture in closing.landing_pictures(found.closed, r, s).items():
             store.write_png(tmp / f"{camera}.png", picture)
-    verdict = "as it should be" if found.ok else f"not as it should be ({s.loop.accept_um:.0f} um): calibrate again"
-    line = f"cross grid: median {found.median_um:.0f}, p95 {found.p95_um:.0f}, max {found.max_um:.0f} um: {verdict}"
-    emit({"selftest": str(out), **told}, json, [line])
+    emit({"selftest": str(out), **told}, json, [found.words(s.loop.accept_um)])
     if not found.ok:
         raise typer.Exit(1)

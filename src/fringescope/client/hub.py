@@ -180,6 +180,14 @@ class Client:
         """The instrument: is it there, what does it do."""
         return InstrumentState(**self.ask("GET", "/api/instrument"))
 
+    def pose(self, board: Mapping[str, Any] | None = None) -> Job:
+        """Photographs the calibration board where it lies now; the first pose of a session says which board it is."""
+        return self.wait(Job(**self.ask("POST", "/api/instrument/poses", {"board": dict(board) if board else None})))
+
+    def calibrate(self) -> Job:
+        """The poses so far to a rig, which is used from then on; the result holds the verdict."""
+        return self.wait(Job(**self.ask("POST", "/api/instrument/calibrate")))
+
     def stop(self) -> None:
         """Dark, whatever is projected."""
         self.ask("POST", "/api/instrument/stop")
@@ -243,6 +251,11 @@ class HubCase:
         """Takes a scan."""
         job = Job(**self.hub.ask("POST", f"{self._path}/scans", {"label": label}))
         return self.hub.wait(job, tell) if wait else job
+
+    def compare(self, before: str, after: str, version: int | None = None) -> Job:
+        """What was cut from one scan to another, and how far from the lines of a version."""
+        body = {"before": before, "after": after, "version": version}
+        return self.hub.wait(Job(**self.hub.ask("POST", f"{self._path}/compare", body)))
 
     def scans(self) -> list[ScanInfo]:
         """Its scans, with their files."""

@@ -31,6 +31,12 @@ class SelfTest:
     max_um: float
     ok: bool
 
+    def words(self, limit_um: float) -> str:
+        """The figures and the verdict in a line."""
+        verdict = "as it should be" if self.ok else f"not as it should be ({limit_um:.0f} um): calibrate again"
+        figures = f"median {self.median_um:.0f}, p95 {self.p95_um:.0f}, max {self.max_um:.0f} um"
+        return f"cross grid: {figures}: {verdict}"
+
 
 def self_test(station: Station, rig: Rig, settings: Settings | None = None) -> SelfTest:
     """Scans what lies under the instrument (a board, or anything flat), projects a cross grid and measures its lines.

@@ -101,6 +101,8 @@ def _staged(
         for beside in _BESIDE:
             if (data / beside).is_file():
                 shutil.copyfile(data / beside, stage / beside)
+        if (data / "rigs").is_dir():
+            shutil.copytree(data / "rigs", stage / "rigs")
         for file in sorted((data / checkpoints.FOLDER).glob("*.jsonl")):
             whole = file.read_bytes()
             (stage / checkpoints.FOLDER).mkdir(exist_ok=True)
@@ -192,7 +194,7 @@ def _into_folder(data: Path, out: Path, source: Path | None, url: str | None) ->
         raise OutputError(f"{out}: is a file; needed a folder, or a name that ends with .zip")
     out.mkdir(parents=True, exist_ok=True, mode=0o700)
     now = datetime.datetime.now(datetime.UTC)
-    target = out / f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+    target = out / f"{now:%Y%m%dT%H%M%S.%f}-{secrets.token_hex(3)}"
     with _staged(data, source, url, out) as (stage, blobs):
         found = Kept(str(target), "sqlite" if source is not None else "postgresql")
         doc = _manifest(stage, blobs, found.database)

@@ -187,6 +187,10 @@ class Hub:
         """Lets go of what is known of a case; it is read again when somebody asks."""
         self._books.pop(case, None)
 
+    def open_cases(self) -> list[str]:
+        """Cases whose truth is at hand: those that anybody has looked at lately."""
+        return list(self._books)
+
     def lit(self, case: str) -> bool:
         """Whether something of a case may be on the projector."""
         book = self._books.get(case)

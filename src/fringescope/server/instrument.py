@@ -10,41 +10,35 @@ import asyncio
 import base64
 import contextlib
 import json
-import shutil
-import tempfile
 import time
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+from fringescope import examination
 from fringescope.devices.watchdog import StopButton, rebuilt
 from fringescope.errors import DeviceError, DeviceLostError, FringescopeError, UsageError
 from fringescope.server import cases
-from fringescope.server import database as db
-from fringescope.server.accounts import new_id
 from fringescope.server.blobs import Blobs
 from fringescope.server.config import Config
 from fringescope.server.hub import INSTRUMENT, Hub
-from fringescope.server.jobs import Tell
 from fringescope.server.processes.parent import Child
+from fringescope.server.shelf import Shelf
 from fringescope.server.truth import Fold, Truth
 from fringescope.settings import to_dict
-from fringescope.store import hash_rig
 from fringescope.types.examination import (
     Check,
     Checked,
     Dark,
-    DeviceBack,
     DeviceLost,
     Guarded,
     GuardLost,
     Previewed,
-    RigChanged,
-    ScanTaken,
     Show,
     Standing,
     Watched,
 )
-from fringescope.wire import Record, ScanFile, ScanInfo
+from fringescope.wire import Record, ScanFile
 from fringescope.wire.documents import InstrumentState
 
 _BEAT_S = 0.1
@@ -56,12 +50,11 @@ _IDLE_S = 600.0  #: the watchdog rests when nothing was projected for so long
 class Instrument:
     """The one instrument of a hub, in the hands of one case at a time."""
 
-    def __init__(self, hub: Hub, blobs: Blobs, config: Config) -> None:
-        self._hub, self._blobs, self._config = hub, blobs, config
+    def __init__(self, hub: Hub, blobs: Blobs, shelf: Shelf, workshop: Child, config: Config) -> None:
+        self._hub, self._blobs, self._shelf, self._config = hub, blobs, shelf, config
         self._devices = Child("fringescope.server.processes.instrument", self._heard, self._devices_ended)
-        self._workshop = Child("fringescope.server.processes.workshop")
+        self._workshop = workshop
         self._settings = to_dict(config.settings)
-        self._rig: Path | None = config.rig
         self._tasks: set[asyncio.Task[Any]] = set()
         self._case: str | None = None  #: whose scan is ready
         self._button: StopButton | None = None
@@ -96,10 +89,10 @@ class Instrument:
         try:
             found = await self._devices.call("open", uri=uri)
             self._cameras = tuple(c["name"] for c in found["cameras"])
-            if self._rig is None:
+            if self._shelf.rig is None:
                 made = self._config.data / "twin-rig.json"
                 await self._devices.call("twin_rig", out=str(made))
-                self._rig = made
+                self._shelf.rig = made
         except FringescopeError as e:
             self._why = str(e)
             raise
@@ -210,32 +203,37 @@ class Instrument:
     async def _check(self, case: str, version: int, truth: Truth) -> None:
         v = next(x for x in truth.exam.versions if x.number == version)
         strokes = [dict(x["stroke"]) for x in truth.versions[version]]
-        folder = Path(tempfile.mkdtemp(dir=self._work(), prefix="check-"))
-        try:
-            if v.rig != self.rig_hash():
-                raise UsageError(f"the scan was made with another rig than this one's ({v.rig[:19]}); scan again")
-            made = await self._workshop.call(
-                "guide", scan=str(await self._scan_folder(case, v.scan)), rig=str(self._rig_file()),
-                settings=json.dumps(self._settings), strokes=strokes, out=str(folder),
-            )  # fmt: skip
-            named = {name: folder / file for name, file in made["files"].items()}
-            files = await asyncio.to_thread(cases.keep_files, self._blobs, named)
-        except FringescopeError as e:
-            await self._hub.tell(case, Checked(version, v.content, "", "", (str(e)[:190],)))
-            return
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-        by_name = {f.name: f.sha256 for f in files}
-        files = [f.model_copy(update={"name": made["files"][f.name], "type": cases.type_of(made["files"][f.name])})
-                 for f in files]  # fmt: skip
-        if (await self._hub.truth_of(case))[0].erased:
-            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
-            return
-        with db.writing(self._hub.engine) as c:
-            cases.insert_files(c, case, f"version-{version}", files)
+        with self._shelf.work("check") as folder:
+            try:
+                made = await self._guide(case, v.scan, strokes, folder)
+            except FringescopeError as e:
+                await self._hub.tell(case, Checked(version, v.content, "", "", (str(e)[:190],)))
+                return
+            files = []
+            for name, file in made["files"].items():
+                sha256, size = await asyncio.to_thread(self._blobs.put, folder / file)
+                files.append((name, ScanFile(name=file, sha256=sha256, size=size, type=cases.type_of(file))))
+        by_name = {name: f.sha256 for name, f in files}
         problems = tuple(" ".join(p.split())[:190] for p in made["problems"])
         word = Checked(version, v.content, by_name.get("pattern", ""), by_name.get("dashed", ""), problems)
-        await self._hub.tell(case, word)
+        plain = examination.to_dict(word)
+        said = await self._hub.note(
+            case, INSTRUMENT, INSTRUMENT, plain.pop("kind"), plain,
+            lambda c: cases.insert_files(c, case, f"version-{version}", [f for _, f in files]),
+        )  # fmt: skip
+        if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for _, f in files])
+
+    async def _guide(self, case: str, scan: str, strokes: list[dict[str, Any]], out: Path) -> Any:
+        """The pictures of strokes; once more if somebody ended the workshop for another reason meanwhile."""
+        how: dict[str, Any] = {
+            "scan": str(await self._shelf.scan(case, scan)), "rig": str(await self._shelf.rig_of(case, scan)),
+            "settings": json.dumps(self._settings), "strokes": strokes, "out": str(out),
+        }  # fmt: skip
+        try:
+            return await self._workshop.call("guide", **how)
+        except DeviceLostError:
+            return await self._workshop.call("guide", **how)
 
     async def _preview(self, case: str, version: int) -> None:
         truth, _ = await self._hub.truth_of(case)
@@ -255,7 +253,8 @@ class Instrument:
                 await self.open()
                 files = {h: str(self._blobs.path(h)) for h in pictures}
                 found = await self._devices.call(
-                    "ready", scan=str(await self._scan_folder(case, scan)), scan_id=scan, rig=str(self._rig_file()),
+                    "ready", scan=str(await self._shelf.scan(case, scan)), scan_id=scan,
+                    rig=str(self._shelf.rig_file()),
                     pictures=files, settings=self._settings,
                 )  # fmt: skip
             finally:
@@ -329,42 +328,6 @@ class Instrument:
         self._why = "the instrument's process ended; it is started again when it is needed"
         self._begin(self._lost("the instrument's process ended"))
 
-    # ----------------------------------------------------------------------------------------------------------- scans
-
-    async def scan(self, case: str, label: str, tell: Tell) -> dict[str, Any]:
-        """Takes a scan for a case: fringes, surface, files, and the word that there is a new one."""
-        if self._shown is not None:
-            raise UsageError("the projector shows a guideline; stop it, then scan")
-        folder = Path(tempfile.mkdtemp(dir=self._work(), prefix="scan-"))
-        try:
-            async with self._hand:
-                self._busy, self._button, self._case = "scanning", None, None
-                try:
-                    await self.open()
-                    await self._devices.call(
-                        "capture", lambda stage, share: tell(stage, 0.4 * share), rig=str(self._rig_file()),
-                        out=str(folder / "capture"), settings=self._settings,
-                    )  # fmt: skip
-                except DeviceLostError:
-                    self._open = False
-                    raise
-                finally:
-                    self._busy = ""
-            try:
-                doc = await self._workshop.call(
-                    "reconstruct", lambda stage, share: tell(stage, 0.4 + 0.5 * share),
-                    capture=str(folder / "capture"), rig=str(self._rig_file()), out=str(folder / "scan"),
-                    settings=self._settings,
-                )  # fmt: skip
-                await self._workshop.call("photographs", scan=str(folder / "scan"))
-            except asyncio.CancelledError:
-                await self._workshop.kill()
-                raise
-            tell("keeping", 0.9)
-            return await self.keep(case, label, folder / "scan", doc)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
     async def forget(self, case: str) -> None:
         """Nothing of a case stays in the memory of its processes. Raises UsageError while it is projected."""
         if self._shown is not None and self._shown[0] == case:
@@ -374,64 +337,23 @@ class Instrument:
         if self._workshop.alive:
             self._begin(self._reported(case, self._workshop.call("forget")))  # once it has done what it does
 
-    async def keep(
-        self, case: str, label: str, folder: Path, doc: dict[str, Any], taken_ns: int | None = None,
-        present: bool = True,
-    ) -> dict[str, Any]:  # fmt: skip
-        """A scan's folder into the case: its files first, then one transaction with the event.
+    # ---------------------------------------------------------------------------------------------------- being busy
 
-        Without `present` it is there to look at, and the case stays at the scan that it has.
-        """
-        named = {str(p.relative_to(folder)): p for p in sorted(folder.rglob("*")) if p.is_file()}
-        files: list[ScanFile] = await asyncio.to_thread(cases.keep_files, self._blobs, named)
-        kept = ("figures", "views", "cloud", "surface", "created", "instrument")
-        info = ScanInfo(
-            id=doc["hash"], case=case, rig=doc["rig"], label=label, taken_ns=taken_ns or self._hub.clock.now_ns(),
-            files=files, figures={k: doc[k] for k in kept if k in doc},
-        )  # fmt: skip
-        truth, _ = await self._hub.truth_of(case)
-        if present and truth.exam.rig not in ("", doc["rig"]):
-            await self._hub.tell(case, RigChanged(doc["rig"]))
-        word = {"scan": info.id, "rig": info.rig, "label": label, "files": len(files)}
-        said = await self._hub.note(
-            case, INSTRUMENT, INSTRUMENT, ScanTaken.__name__ if present else "evidence", word,
-            lambda c: cases.insert_scan(c, info),
-        )  # fmt: skip
-        if said.refused:
-            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
-            raise UsageError(said.refused)
-        if truth.exam.lost:
-            for device in truth.exam.lost:
-                await self._hub.tell(case, DeviceBack(device))
-        if present:
-            self._begin(self._prepare(case, info.id))
-        return {"scan": info.id, "seq": said.seq}
-
-    async def _prepare(self, case: str, scan: str) -> None:
-        with contextlib.suppress(FringescopeError):
-            await self._workshop.call(
-                "prepare", scan=str(await self._scan_folder(case, scan)), rig=str(self._rig_file()),
-                settings=json.dumps(self._settings),
-            )  # fmt: skip
-
-    async def carry(self, case: str, version: int, tell: Tell) -> dict[str, Any]:
-        """Strokes of a stale version laid on the present scan, for the operator to look at."""
-        truth, _ = await self._hub.truth_of(case)
-        v = next((x for x in truth.exam.versions if x.number == version), None)
-        if v is None or not truth.exam.scan or v.scan == truth.exam.scan:
-            raise UsageError(f"version {version} has nothing to carry over to another scan")
-        tell("registration", 0.1)
-        found = await self._workshop.call(
-            "carry", old=str(await self._scan_folder(case, v.scan)),
-            new=str(await self._scan_folder(case, truth.exam.scan)), rig=str(self._rig_file()),
-            settings=json.dumps(self._settings), strokes=[dict(x["stroke"]) for x in truth.versions[version]],
-        )  # fmt: skip
-        meaning = {x["stroke"]["id"]: x["meaning"] for x in truth.versions[version]}
-        strokes = []
-        for document in found["strokes"]:
-            of = meaning.get(document["id"], "cut")
-            strokes.append({"stroke": {**document, "id": f"{document['id']}-{new_id('c')[-6:]}"}, "meaning": of})
-        return {**found, "strokes": strokes, "version": version, "scan": truth.exam.scan}
+    @contextlib.asynccontextmanager
+    async def busy(self, what: str) -> AsyncIterator[Child]:
+        """The devices, for something else than projecting. Raises UsageError while something is projected."""
+        if self._shown is not None:
+            raise UsageError("the projector shows a guideline; stop it first")
+        async with self._hand:
+            self._busy, self._button, self._case = what, None, None
+            try:
+                await self.open()
+                yield self._devices
+            except DeviceLostError:
+                self._open = False
+                raise
+            finally:
+                self._busy = ""
 
     async def live(self, camera: str, width: int, quality: int) -> dict[str, Any]:
         """What a camera sees now. Raises DeviceError."""
@@ -445,25 +367,3 @@ class Instrument:
         """For the simulated instrument: something happens to the specimen."""
         await self.open()
         await self._devices.call("befall", what=what)
-
-    # ----------------------------------------------------------------------------------------------------- small things
-
-    def _work(self) -> Path:
-        folder = self._config.data / "work"
-        folder.mkdir(exist_ok=True)
-        return folder
-
-    def _rig_file(self) -> Path:
-        if self._rig is None:
-            raise DeviceError("this hub has no rig; calibrate the instrument, and name its rig with --rig")
-        return self._rig
-
-    def rig_hash(self) -> str:
-        """Of the rig in use."""
-        return hash_rig(self._rig_file())
-
-    async def _scan_folder(self, case: str, scan: str) -> Path:
-        files = (await asyncio.to_thread(cases.files_of, self._hub.engine, case, scan)).get(scan)
-        if not files:
-            raise UsageError(f"case {case} has no scan {scan[:19]}; scan again")
-        return await asyncio.to_thread(cases.lay_out, self._blobs, files, self._config.data, case, scan)

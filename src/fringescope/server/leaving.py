@@ -32,6 +32,7 @@ from fringescope.server.config import Config
 from fringescope.server.hub import Hub
 from fringescope.server.instrument import Instrument
 from fringescope.server.jobs import Jobs, Tell
+from fringescope.server.lab import Lab
 from fringescope.server.processes.parent import Child
 from fringescope.server.rooms import ERASED
 from fringescope.server.unpacking import Unpacked
@@ -52,10 +53,10 @@ class Leaving:
 
     def __init__(
         self, config: Config, hub: Hub, blobs: Blobs, accounts: Accounts, jobs: Jobs, instrument: Instrument,
-        checkpoints: Checkpoints,
+        lab: Lab, checkpoints: Checkpoints,
     ):  # fmt: skip
         self._config, self._hub, self._blobs, self._accounts = config, hub, blobs, accounts
-        self._jobs, self._instrument, self._key = jobs, instrument, checkpoints.key
+        self._jobs, self._instrument, self._lab, self._key = jobs, instrument, lab, checkpoints.key
         self._packer = Child("fringescope.server.processes.packer")
         self._turn = asyncio.Lock()
 
@@ -231,7 +232,7 @@ class Leaving:
                     raise HereAlreadyError(f"scan {doc['hash'][:19]} is in this case already")
                 tell("keeping", 0.9)
                 taken = _time_of(doc.get("created"))
-                return await self._instrument.keep(case, label, folder, doc, taken, present)
+                return await self._lab.keep(case, label, folder, doc, taken, present)
 
     async def _look_at(self, folder: Path, tell: Tell) -> dict[str, Any]:
         doc: dict[str, Any] = await self._packed(

@@ -45,6 +45,7 @@ MAY: dict[str, frozenset[PersonRole]] = {
     # the instrument
     "scan.take": frozenset({OPERATOR}),
     "scan.add": frozenset({OPERATOR}),
+    "instrument.calibrate": frozenset({OPERATOR}),
     "instrument.read": frozenset({OPERATOR, EXPERT, OBSERVER, ADMIN}),
     "instrument.stop": EVERYBODY,
     "video": frozenset({OPERATOR, EXPERT, OBSERVER}),

@@ -22,8 +22,11 @@ from fringescope.server.hub import Hub
 from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
+from fringescope.server.lab import Lab
 from fringescope.server.leaving import Leaving, finish_erasures
+from fringescope.server.processes.parent import Child
 from fringescope.server.rooms import Rooms
+from fringescope.server.shelf import Shelf
 from fringescope.server.throttle import Throttle
 
 
@@ -41,6 +44,7 @@ class Site:
     hub: Hub
     jobs: Jobs
     instrument: Instrument
+    lab: Lab
     requests: Throttle
     logins: Throttle
     ops: Throttle
@@ -91,15 +95,17 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         rooms = Rooms(limits.waiting)
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
-        instrument = Instrument(hub, blobs, config)
         checkpoints = Checkpoints(engine, clock, config.data)
         accounts.gone = rooms.expel
+        shelf, workshop = Shelf(config.data, engine, blobs, config.rig), Child("fringescope.server.processes.workshop")
+        instrument = Instrument(hub, blobs, shelf, workshop, config)
+        lab = Lab(hub, blobs, shelf, instrument, workshop, config)
         site = Site(
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
-            instrument, Throttle(limits.requests_per_s, limits.requests_burst),
+            instrument, lab, Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
             Throttle(limits.ops_per_s, limits.ops_burst), checkpoints,
-            Leaving(config, hub, blobs, accounts, jobs, instrument, checkpoints), lock,
+            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock,
         )  # fmt: skip
         undo.pop_all()
     return site

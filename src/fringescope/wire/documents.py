@@ -198,6 +198,20 @@ class AskedCarry(_Document):
     version: int
 
 
+class AskedCompare(_Document):
+    """Two scans of a case, and the version whose lines the cut should have followed."""
+
+    before: Word
+    after: Word
+    version: int | None = None
+
+
+class NewPose(_Document):
+    """A pose of the calibration board; the first of a session says which board it is, as its board.json does."""
+
+    board: dict[str, Any] | None = None
+
+
 class JobState(StrEnum):
     """How far a job is."""
 

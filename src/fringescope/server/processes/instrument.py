@@ -8,6 +8,7 @@ of it; a suspect one gets its dashed lines here.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import threading
 import time
@@ -26,6 +27,7 @@ from fringescope.devices.watchdog import Guard, described
 from fringescope.errors import CaptureError, DeviceError, FringescopeError, RejectedError
 from fringescope.pipeline import guidance as recipe
 from fringescope.pipeline import projecting, watching
+from fringescope.pipeline.selftest import self_test
 from fringescope.server.processes.child import Call
 from fringescope.settings import Settings, from_dict
 from fringescope.store.images import decode_png
@@ -118,12 +120,21 @@ class _Ready:
         self.station.projector.dark()
 
     def _watch(self) -> None:
-        while not self._over.wait(self.s.loop.look_s):
-            if self.guard.lost:
-                self.pair = None
-                self._emit({"guard": "lost", "why": self.guard.lost})
-                return
-            self.look()
+        """Looks again and again; however it ends unasked, it is dark and the hub hears of it."""
+        why = "the looking ended: this is a bug; report it"
+        try:
+            while not self._over.wait(self.s.loop.look_s):
+                if self.guard.lost:
+                    why = self.guard.lost
+                    return
+                self.look()
+        except FringescopeError as e:
+            why = self.guard.lost or str(e)
+        finally:
+            if not self._over.is_set():
+                with contextlib.suppress(FringescopeError):
+                    self.dark()
+                self._emit({"guard": "lost", "why": why})
 
     def close(self) -> None:
         self._over.set()
@@ -145,6 +156,7 @@ class Hand:
         self.calls: dict[str, Callable[..., Any]] = {
             "open": self.open_, "close": self.close, "capture": self.capture, "ready": self.ready, "rest": self.rest,
             "look": self.look, "live": self.live, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
+            "selftest": self.selftest,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {"dark": self.dark, "beat": self.beat}
 
@@ -181,14 +193,20 @@ class Hand:
             self._station.close()
         self._station, self._uri = None, ""
 
-    def capture(self, call: Call, rig: str, out: str, settings: dict[str, Any]) -> dict[str, Any]:
-        """Photographs the specimen and plays the fringes; a capture in a new folder."""
+    def capture(self, call: Call, rig: str | None, out: str, settings: dict[str, Any]) -> dict[str, Any]:
+        """Photographs what lies there and plays the fringes; a capture in a new folder.
+
+        Without a rig: both directions, as a calibration needs them of its board.
+        """
         station, s = self._opened(), from_dict(settings)
         self.rest(call)
         station.projector.release()  # after a cut it is dark, and may play fringes again
-        r = store.read_rig(Path(rig))
         formats = {c.info.serial: c.info.pixel_formats[0] for c in station.cameras}
-        plan = patterns.paper_plan(r, formats, s.patterns)
+        i = station.projector.info
+        if rig is not None:
+            plan = patterns.paper_plan(store.read_rig(Path(rig)), formats, s.patterns)
+        else:
+            plan = patterns.calibration_plan((i.width, i.height), i.layout, list(formats), formats, s.patterns)
         by_name = {c.info.serial: c for c in station.cameras}
         cameras = [by_name[v.camera] for v in plan.views]
         total = sum(len(v.keys) for v in plan.views)
@@ -208,14 +226,13 @@ class Hand:
 
         def views() -> Iterator[ViewInput]:
             for view, camera, photo in zip(plan.views, cameras, photos, strict=True):
-                shown = patterns.images(view, r.projector, s.patterns)
+                shown = [(key, image) for c, key, image in patterns.plan_images(plan, s.patterns) if c == view.camera]
                 frames = capturing.stream(station.projector, camera, shown, view, s.capture)
                 yield ViewInput(view, counted(frames, view.camera), photo)
 
-        p = r.projector
         try:
             with store.new_folder(Path(out), marker="capture.json") as tmp:
-                store.put_capture(tmp, p.width, p.height, p.layout, views(), {"instrument": self._uri})
+                store.put_capture(tmp, i.width, i.height, i.layout, views(), {"instrument": self._uri})
         finally:
             station.projector.dark()
         return {"views": [v.camera for v in plan.views], "frames": total}
@@ -278,6 +295,18 @@ class Hand:
         self._ready.look()
         return {"validity": None if self._ready.standing is None else self._ready.standing.value}
 
+    def selftest(self, call: Call, rig: str, settings: dict[str, Any]) -> dict[str, Any]:
+        """Projects a cross grid on the board that lies there, and measures where its lines land."""
+        s = from_dict(settings)
+        call.progress("self-test", 0.0)
+        station = self._opened()
+        try:
+            found = self_test(station, store.read_rig(Path(rig)), s)
+        finally:
+            station.projector.dark()
+        figures = {"median_um": found.median_um, "p95_um": found.p95_um, "max_um": found.max_um}
+        return {**figures, "ok": found.ok, "words": found.words(s.loop.accept_um)}
+
     def live(self, _call: Call, camera: str, width: int, quality: int) -> dict[str, Any]:
         """What a camera sees now, as JPEG in base64, at most so wide."""
         import cv2
@@ -319,11 +348,18 @@ class Hand:
         """For the simulated instrument alone: what befalls the specimen, as `twin.changes.changed` takes it."""
         from fringescope.devices.simulated import SimulatedStation
         from fringescope.twin import changes
+        from fringescope.twin import scene as scenes
 
         station = self._opened()
         if not isinstance(station, SimulatedStation):
             raise DeviceError("this instrument is not simulated; move the specimen by hand")
-        station.world.change(changes.changed(station.world.scene, what))
+        world = station.world
+        if "scene" in what:  # another thing lies there now, as a board in its next pose
+            name, seed = what["scene"], world.scene.seed
+            pose, board = int(what.get("pose", "0")), what.get("board", "checkerboard")
+            world.change(scenes.make(name, seed, pose=pose, board=board))
+        else:
+            world.change(changes.changed(world.scene, what))
 
     def twin_rig(self, _call: Call, out: str) -> str:
         """For the simulated instrument alone: its true rig, as a file."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from fringescope import export, store
+from fringescope.cli.calibrating import calibrate_into
+from fringescope.cli.comparing import compare_into
 from fringescope.cli.scanning import scan_into
 from fringescope.errors import EmptyResultError
 from fringescope.pipeline import carrying
@@ -29,6 +31,11 @@ class _Told:
     def run(self, stage: str, work: Callable[[], Any]) -> Any:
         self._call.progress(stage, 0.95)
         return work()
+
+    def track(self, items: Iterable[Any], stage: str, total: int) -> Iterator[Any]:
+        for i, item in enumerate(items):
+            self._call.progress(stage, 0.5 * i / max(1, total))
+            yield item
 
 
 def reconstruct(call: Call, capture: str, rig: str, out: str, settings: dict[str, Any]) -> dict[str, Any]:
@@ -123,6 +130,37 @@ def carry(
     return plain
 
 
+def compare(
+    call: Call, before: str, after: str, rig: str, out: str, settings: dict[str, Any], strokes: list[dict[str, Any]]
+) -> dict[str, Any]:  # fmt: skip
+    """What changed from one scan to another, and how far the cut ran from `strokes`; returns its compare.json."""
+    progress: Any = _Told(call)
+    guidelines = None
+    if strokes:
+        guidelines = Path(out).with_suffix(".strokes.json")
+        scan = store.read_scan(before, grids=False, check=False).document
+        bound = {"scan": scan["hash"], "rig": scan["rig"]}
+        doc = {"format": "fringescope-guidelines", "version": 1, **bound, "strokes": strokes}
+        store.write_json(guidelines, doc)
+    with store.new_folder(Path(out), marker="compare.json") as tmp:
+        doc = compare_into(
+            tmp, Path(before), Path(after), from_dict(settings), progress, rig=Path(rig), guidelines=guidelines
+        )
+    plain: dict[str, Any] = store.plain(doc)
+    return plain
+
+
+def calibrate(call: Call, session: str, rig: str, page: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """A session of board captures to a rig and its report; returns the verdict. Raises CalibrationError."""
+    progress: Any = _Told(call)
+    _, evidence, why = calibrate_into(Path(rig), Path(page), Path(session), from_dict(settings), progress, force=True)
+    plain: dict[str, Any] = store.plain(
+        {"verdict": evidence.verdict, "good": evidence.good, "weak": evidence.weak, "next": evidence.next,
+         "not_used": why, "rig": store.hash_rig(Path(rig))}
+    )  # fmt: skip
+    return plain
+
+
 def photographs(call: Call, scan: str) -> dict[str, str]:
     """The photograph of each camera as JPEG beside the scan; the names of the files."""
     from fringescope import fuse
@@ -156,6 +194,7 @@ class Hand:
         self.calls: dict[str, Callable[..., Any]] = {
             "reconstruct": reconstruct, "prepare": prepare, "guide": guide, "carry": carry, "photographs": photographs,
             "forget": forget,
+            "compare": compare, "calibrate": calibrate,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {}
 

@@ -13,7 +13,7 @@ from fringescope.errors import FringescopeError, UsageError
 from fringescope.server import cases as kept
 from fringescope.server.asking import CaseId, Who, may_see, problems
 from fringescope.wire import Job, Op, ScanFile, ScanInfo
-from fringescope.wire.documents import AskedCarry, Ended, InstrumentState, NewScan
+from fringescope.wire.documents import AskedCarry, AskedCompare, Ended, InstrumentState, NewPose, NewScan
 from fringescope.wire.room import Said
 
 router = APIRouter(prefix="/api")
@@ -33,11 +33,9 @@ def scans(case: CaseId, who: Who) -> list[ScanInfo]:
 async def scan(case: CaseId, asked: NewScan, who: Who) -> Job:
     """Takes a scan, as a job."""
     await run_in_threadpool(who.case, case, "scan.take")
-    instrument = who.site.instrument
+    lab = who.site.lab
     try:
-        return who.site.jobs.begin(
-            "scan", case, who.speaker.person, lambda tell: instrument.scan(case, asked.label, tell)
-        )
+        return who.site.jobs.begin("scan", case, who.speaker.person, lambda tell: lab.scan(case, asked.label, tell))
     except UsageError as e:
         raise HTTPException(409, str(e)) from None
 
@@ -46,11 +44,9 @@ async def scan(case: CaseId, asked: NewScan, who: Who) -> Job:
 async def carry(case: CaseId, asked: AskedCarry, who: Who) -> Job:
     """Lays the strokes of a stale version on the present scan, as a job: for the operator to look at."""
     await run_in_threadpool(who.case, case, "carry_over")
-    instrument = who.site.instrument
+    lab = who.site.lab
     try:
-        return who.site.jobs.begin(
-            "carry", case, who.speaker.person, lambda tell: instrument.carry(case, asked.version, tell)
-        )
+        return who.site.jobs.begin("carry", case, who.speaker.person, lambda tell: lab.carry(case, asked.version, tell))
     except UsageError as e:
         raise HTTPException(409, str(e)) from None
 
@@ -67,6 +63,20 @@ async def carry_over(case: CaseId, op: Op, who: Who) -> Said:
         raise HTTPException(400, "no such job laid this version on this scan; let it be laid there first")
     extra = {"strokes": result["strokes"], "residual_um": result["residual_um"]}
     return await who.site.hub.say(case, who.speaker, op, extra)
+
+
+@router.post("/cases/{case}/compare", status_code=202, tags=["scans"], responses=problems(401, 403, 404, 409))
+async def compare(case: CaseId, asked: AskedCompare, who: Who) -> Job:
+    """What was cut from one scan of a case to another, as a job; its maps and figures go into the case."""
+    await run_in_threadpool(who.case, case, "scan.take")
+    lab = who.site.lab
+    try:
+        return who.site.jobs.begin(
+            "compare", case, who.speaker.person,
+            lambda tell: lab.compare(case, asked.before, asked.after, asked.version, tell),
+        )  # fmt: skip
+    except UsageError as e:
+        raise HTTPException(409, str(e)) from None
 
 
 @router.get("/cases/{case}/files", tags=["scans"], responses=problems(401, 403, 404))
@@ -156,6 +166,27 @@ async def stop(who: Who) -> Ended:
     who.must("instrument.stop")
     await who.site.instrument.stop_all(f"stopped by {who.speaker.person}")
     return Ended()
+
+
+@router.post("/instrument/poses", status_code=202, tags=["instrument"], responses=problems(401, 403, 409))
+async def pose(asked: NewPose, who: Who) -> Job:
+    """Photographs the calibration board where it lies now, as a job; the first pose says which board it is."""
+    who.must("instrument.calibrate")
+    board, lab = asked.board, who.site.lab
+    try:
+        return who.site.jobs.begin("pose", None, who.speaker.person, lambda tell: lab.pose(board, tell))
+    except UsageError as e:
+        raise HTTPException(409, str(e)) from None
+
+
+@router.post("/instrument/calibrate", status_code=202, tags=["instrument"], responses=problems(401, 403, 409))
+async def calibrate(who: Who) -> Job:
+    """The poses so far to a rig, as a job; scans are made with it from then on."""
+    who.must("instrument.calibrate")
+    try:
+        return who.site.jobs.begin("calibrate", None, who.speaker.person, who.site.lab.calibrate)
+    except UsageError as e:
+        raise HTTPException(409, str(e)) from None
 
 
 @router.post("/instrument/simulate", tags=["instrument"], responses=problems(400, 401, 403, 503))
