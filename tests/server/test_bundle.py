@@ -385,7 +385,7 @@ LOGS: dict[str, tuple[Callable[[list[dict[str, Any]]], Any], bool, str]] = {
     "one without what it needs": (lambda x: x[-1].update(kind="put", payload={}), True, "makes no sense"),
     "one of no kind": (lambda x: x[-1].update(kind="format c:"), True, "could not happen here"),
     "one of nobody's role": (lambda x: x[5].update(role="king"), True, "makes no sense"),
-    "one that could not happen": (lambda x: x[-1].update(payload={**x[-1]["payload"], "version": 77}), True,
+    "one that could not happen": (lambda x: x[-2].update(payload={**x[-2]["payload"], "version": 77}), True,
                                   "could not happen"),
     "one said twice": (lambda x: x[-1].update({k: x[-2][k] for k in ("actor", "client", "number")}), True,
                        "cannot be kept"),
