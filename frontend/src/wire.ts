@@ -40,12 +40,19 @@ export interface AskedCompare {
   version?: number | null;
 }
 
+/** A case to erase, and why: a request, a rule, the end of a study. */
+export interface AskedErasure {
+  why: string;
+}
+
 /** What a check of the log found. */
 export interface AuditReport {
   cases: number;
   events: number;
   faults: string[];
   whole: boolean;
+  checkpoints?: number;
+  covered_ns?: number;
 }
 
 /** The operator takes the strokes of a stale version over to the present scan, as job `job` has laid them there. */
@@ -117,6 +124,12 @@ export interface Confirm {
 /** It is done. */
 export interface Ended {
   done?: string;
+}
+
+/** A case was erased: so many events lost their words, so many files are gone. */
+export interface Erased {
+  events: number;
+  files: number;
 }
 
 /** An event of the log, in its order and each once. */

@@ -46,3 +46,16 @@ def sign_in(hub: Server) -> Iterator[SignIn]:
     yield enter
     for client in opened:
         client.close()
+
+
+@pytest.fixture(scope="session")
+def scan_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small scan of a wet specimen, as `fringescope reconstruct` leaves it: not to be changed."""
+    from fringescope import cli
+
+    at = tmp_path_factory.mktemp("small")
+    made = ["simulate", "tissue-domed", "--scale", "0.06", "--seed", "3", "--out", str(at / "capture")]
+    assert cli.run(made) == 0
+    rig = at / "capture" / "truth" / "rig.json"
+    assert cli.run(["reconstruct", str(at / "capture"), "--rig", str(rig), "--out", str(at / "scan")]) == 0
+    return at / "scan"

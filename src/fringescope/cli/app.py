@@ -89,6 +89,15 @@ VERBS: dict[str, tuple[str, str]] = {
         "serving",
         "Accounts of a hub that does not run just now; a password is asked for, or read from a pipe.",
     ),
+    "audit": (
+        "auditing",
+        "A hub's log, judged: was any event altered, removed or added? Signed checkpoints of it; it may run meanwhile.",
+    ),
+    "backup": (
+        "keeping",
+        "All of a hub, kept elsewhere; it may run meanwhile. Keep it as safe as the hub: patients and keys are in it.",
+    ),
+    "restore": ("keeping", "A hub's folder out of a backup; each file and the whole log are compared first."),
     "bench": (
         "timing",
         "Times a scan against a plain copy of the same memory and against other decoders, all in one run.",

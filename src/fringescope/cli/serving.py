@@ -1,4 +1,4 @@
-"""Verbs of the hub: serve, person, audit."""
+"""Verbs of the hub: serve, person."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Database = Annotated[
 HOME = Path("fringescope-hub")
 
 
-def _needs_extra() -> None:
+def needs_extra() -> None:
     """Raises UsageError where the hub's packages are missing."""
     try:
         import fastapi
@@ -71,7 +71,7 @@ def serve(
     set_: SetOption = None,
 ) -> None:
     """The hub: cases, shared drawing, and the instrument, for the operator here and experts anywhere."""
-    _needs_extra()
+    needs_extra()
     from fringescope.server import running
     from fringescope.server.config import Config, Provider
 
@@ -105,7 +105,7 @@ def _secret(file: Path | None) -> str:
 
 
 def _config(data: Path, database: str | None) -> Config:
-    _needs_extra()
+    needs_extra()
     from fringescope.server.config import Config
 
     if not data.is_dir() and database is None:
@@ -123,7 +123,7 @@ def person(
     json: Json = False,
 ) -> None:
     """Accounts of a hub that does not run just now; a password is asked for, or read from a pipe."""
-    _needs_extra()
+    needs_extra()
     from fringescope.server.site import open_site
     from fringescope.wire import PersonRole
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 import ssl
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -12,7 +15,7 @@ import httpx
 
 from fringescope.errors import FringescopeError
 from fringescope.wire import Account, Case, CaseList, Invitation, Job, JobState, Person, ScanInfo
-from fringescope.wire.documents import CaseState, InstrumentState
+from fringescope.wire.documents import CaseState, Erased, InstrumentState
 from fringescope.wire.room import Event, Said
 
 if TYPE_CHECKING:
@@ -68,21 +71,20 @@ class Client:
         return answer.json() if answer.content else None
 
     def raw(
-        self, method: str, path: str, body: Any = None, content: bytes | None = None, **query: Any
-    ) -> httpx.Response:
+        self, method: str, path: str, body: Any = None, content: bytes | Iterable[bytes] | None = None,
+        headers: Mapping[str, str] | None = None, **query: Any,
+    ) -> httpx.Response:  # fmt: skip
         """One request, its answer as it came."""
-        headers = {"X-CSRF-Token": self.account.csrf} if self.account and method != "GET" else {}
+        headers = dict(headers or {})
+        if self.account and method != "GET":
+            headers["X-CSRF-Token"] = self.account.csrf
         params = {k: v for k, v in query.items() if v is not None}
         try:
             answer = self.http.request(method, path, json=body, content=content, params=params, headers=headers)
         except httpx.HTTPError as e:
             raise HubError(f"{self.url}: {e or type(e).__name__}; is the hub there?") from e
         if answer.status_code >= 400:
-            try:
-                why = str(answer.json()["detail"])
-            except (ValueError, KeyError, TypeError):
-                why = f"{method} {path}: status {answer.status_code}"
-            raise HubError(why, answer.status_code)
+            raise HubError(_why(answer, f"{method} {path}"), answer.status_code)
         return answer
 
     # ---------------------------------------------------------------------------------------------------------- people
@@ -141,6 +143,39 @@ class Client:
         """A case by its identifier."""
         return HubCase(self, Case(**self.ask("GET", f"/api/cases/{case}")).id)
 
+    def import_case(self, bundle: Path) -> HubCase:
+        """A bundle becomes a case again."""
+        return HubCase(self, Case(**self.send("/api/cases/import", bundle).json()).id)
+
+    def send(self, path: str, file: Path, **query: Any) -> httpx.Response:
+        """A file as the body of a request, a piece at a time."""
+        with file.open("rb") as f:
+            size = {"content-length": str(file.stat().st_size), "content-type": "application/zip"}
+            return self.raw("POST", path, content=iter(lambda: f.read(1 << 20), b""), headers=size, **query)
+
+    def fetch(self, path: str, to: Path, **query: Any) -> Path:
+        """An answer into a file, a piece at a time; the file is there whole or not at all."""
+        part = to.with_name(f".{to.name}.part")
+        try:
+            with self._streamed(path, query) as answer, part.open("wb") as out:
+                for piece in answer.iter_bytes(1 << 20):
+                    out.write(piece)
+            part.replace(to)
+        except httpx.HTTPError as e:
+            raise HubError(f"{self.url}: {e or type(e).__name__}; is the hub there?") from e
+        finally:
+            part.unlink(missing_ok=True)
+        return to
+
+    @contextlib.contextmanager
+    def _streamed(self, path: str, query: Mapping[str, Any]) -> Iterator[httpx.Response]:
+        params = {k: v for k, v in query.items() if v is not None}
+        with self.http.stream("GET", path, params=params, timeout=600) as answer:
+            if answer.status_code >= 400:
+                answer.read()
+                raise HubError(_why(answer, f"GET {path}"), answer.status_code)
+            yield answer
+
     # -------------------------------------------------------------------------------------------------- the instrument
 
     def instrument(self) -> InstrumentState:
@@ -186,6 +221,13 @@ def _trusting(certificate: str) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=certificate)
     except OSError as e:  # an SSLError is one, too
         raise HubError(f"{certificate}: {e.strerror or e}; needed a certificate (PEM) of the hub") from e
+
+
+def _why(answer: httpx.Response, asked: str) -> str:
+    try:
+        return str(answer.json()["detail"])
+    except (ValueError, KeyError, TypeError):
+        return f"{asked}: status {answer.status_code}"
 
 
 class HubCase:
@@ -235,6 +277,24 @@ class HubCase:
         if to is not None:
             to.write_bytes(data)
         return data
+
+    def add_scan(self, scan: Path, label: str = "", present: bool | None = None, wait: bool = True) -> Job:
+        """A scan that was made elsewhere: its folder, or that as a zip file."""
+        with tempfile.TemporaryDirectory() as aside:
+            file = scan
+            if scan.is_dir():
+                file = Path(shutil.make_archive(str(Path(aside) / "scan"), "zip", scan))
+            told = None if present is None else str(present).lower()
+            job = Job(**self.hub.send(f"{self._path}/scans/import", file, label=label, present=told).json())
+        return self.hub.wait(job) if wait else job
+
+    def bundle(self, to: Path, patient: bool = False) -> Path:
+        """All of it as one file; with `patient` for operators, it names the patient."""
+        return self.hub.fetch(f"{self._path}/bundle", to, patient="true" if patient else None)
+
+    def erase(self, why: str) -> Erased:
+        """Takes it out for good, for administrators; the log still verifies."""
+        return Erased(**self.hub.ask("POST", f"{self._path}/erase", {"why": why}))
 
     def invite(self, name: str, role: str = "expert", hours: float = 72) -> Invitation:
         """Invites somebody; the answer alone holds token and code."""

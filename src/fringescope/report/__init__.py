@@ -1,6 +1,7 @@
 """Pictures for people: error maps, reasons, rendered clouds and surfaces, contact sheets."""
 
 from fringescope.report.calibration import calibration_page
+from fringescope.report.case import write_case
 from fringescope.report.comparison import change_colours, change_limit, change_picture, change_surface
 from fringescope.report.figures import (
     REASON_COLOURS,
@@ -54,4 +55,5 @@ __all__ = [
     "sighting_picture",
     "story",
     "watched_picture",
+    "write_case",
 ]

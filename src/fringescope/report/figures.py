@@ -122,9 +122,7 @@ def error_map(
         fig = Figure(figsize=(W, H), dpi=150, facecolor=PAPER)
         ax = fig.add_axes((0.75 / W, 0.7 / H, map_w / W, map_h / H))
         ax.set_facecolor(NOTHING)
-        ax.imshow(
-            grid, origin="lower", extent=extent, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest"
-        )
+        ax.imshow(grid, origin="lower", extent=extent, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
         ax.set_xlabel("mm")
         ax.set_ylabel("mm")
         ax.tick_params(length=3)
@@ -208,9 +206,7 @@ def _grey(a: NDArray[Any]) -> U8:
     return out
 
 
-def reasons_map(
-    reasons: U16, title: str, backdrop: NDArray[Any] | None = None, path: Path | str | None = None
-) -> U8:
+def reasons_map(reasons: U16, title: str, backdrop: NDArray[Any] | None = None, path: Path | str | None = None) -> U8:
     """The picture of `reasons_picture` with a legend: each reason that occurs, with its share of the pixels."""
     rgb = reasons_picture(reasons, backdrop)
     h, w = reasons.shape

@@ -77,9 +77,7 @@ def landing_caption(x: Landing) -> str:
     return "; ".join((told, *x.words))
 
 
-def landing_picture(
-    photo: F32, camera: Camera, index: int, landings: tuple[Landing, ...], wide: int = WIDE
-) -> U8:
+def landing_picture(photo: F32, camera: Camera, index: int, landings: tuple[Landing, ...], wide: int = WIDE) -> U8:
     """Where the lines were found, over a picture taken while they were projected; (h, w, 3) RGB.
 
     `photo` (H, W, 3) linear light of camera number `index`. A green dot is a place where a line was found; the red bar

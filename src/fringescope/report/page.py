@@ -137,7 +137,7 @@ def failed(
     out.append(
         '<h2>What was found</h2><p class="lead">Corners · white squares in each picture.</p>'
         f'<section class="card"><div class="scroll"><table><tr><th>pose</th>{head}'
-        f'<th class=note>said about them</th></tr>{"".join(rows)}</table></div></section>'
+        f"<th class=note>said about them</th></tr>{''.join(rows)}</table></div></section>"
     )
     plots = []
     for k in cameras:

@@ -54,4 +54,3 @@ def watched_picture(found: Watched, pictures: Sequence[Picture]) -> U8:
         parts.append(out)
     height = max(p.shape[0] for p in parts)
     return np.concatenate([np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0))) for p in parts], axis=1)
-

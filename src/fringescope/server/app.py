@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException as RawHTTPException
 from fringescope import __version__
 from fringescope.errors import FringescopeError, OutputError
 from fringescope.server.config import Config
-from fringescope.server.routes import audit, cases, passkeys, people, room, scans, signing
+from fringescope.server.routes import audit, cases, leaving, passkeys, people, room, scans, signing
 from fringescope.server.security import Guarded
 from fringescope.server.site import Site, open_site
 
@@ -31,13 +31,17 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         await site.hub.start()
         await site.instrument.start()
         doors = asyncio.create_task(_watch_doors(site), name="doors")
+        points = asyncio.create_task(site.checkpoints.run(config.checkpoint_s), name="checkpoints")
         try:
             yield
         finally:
             doors.cancel()
             site.rooms.end()
             await site.jobs.stop()
+            await site.leaving.stop()
+            points.cancel()
             await site.hub.stop()
+            await site.checkpoints.try_to_write()
             await site.instrument.stop()
             site.close()
 
@@ -51,7 +55,7 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         openapi_url="/openapi.json",
     )
     app.state.site = site
-    for part in (signing, passkeys, people, cases, scans, audit, room):
+    for part in (signing, passkeys, people, leaving, cases, scans, audit, room):
         app.include_router(part.router)
     _explain(app)
     app.add_middleware(Guarded, config=config, requests=site.requests)

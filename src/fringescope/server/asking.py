@@ -15,10 +15,12 @@ from fringescope.server.config import Config
 from fringescope.server.rights import Speaker, refusal
 from fringescope.server.security import is_local
 from fringescope.server.site import Site
+from fringescope.server.truth import ERASED
 from fringescope.wire import PersonRole, Problem
 
 CaseId = Annotated[str, Path(pattern=r"^case-[0-9a-f]{20}$", description="Identifier of a case.")]
 _LONG_OP = 50_000  #: bytes of an op that counts as two
+_OF_ERASED = ("case.read", "job.read")  #: what may still be asked of a case that was erased
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
 
@@ -47,7 +49,8 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
         422: "the request is not what is described here", 429: "too often", 503: "the instrument does not answer",
         507: "the disk is full",
     }  # fmt: skip
-    return {c: {"model": Problem, "description": words[c]} for c in (*codes, 422, 429)}
+    more = (410,) if 404 in codes else ()  # of what was there, but was erased
+    return {c: {"model": Problem, "description": words[c]} for c in (*codes, *more, 422, 429)}
 
 
 def site_of(request: Request) -> Site:
@@ -80,6 +83,8 @@ class Asking:
         self.must(what)
         if not may_see(self.site, self.speaker, case):
             raise HTTPException(404, "there is no such case, or you were not invited to it")
+        if what not in _OF_ERASED and cases.is_erased(self.site.engine, case):
+            raise HTTPException(410, ERASED)
 
 
 def may_see(site: Site, speaker: Speaker, case: str) -> bool:

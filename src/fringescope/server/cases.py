@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mimetypes
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from fringescope.server.blobs import Blobs
 from fringescope.wire import Case, ScanFile, ScanInfo, Specimen, Status
 from fringescope.wire.documents import Patient
 
+LAID_OUT = "laid-out"  #: folders of scans, for who reads folders
 _TYPES = {".glb": "model/gltf-binary", ".ply": "application/octet-stream", ".npy": "application/octet-stream",
           ".json": "application/json"}  # fmt: skip
 
@@ -76,7 +78,13 @@ def get(engine: sa.Engine, case: str, with_patient: bool = False) -> Case | None
 
 
 def search(
-    engine: sa.Engine, words: str, status: str | None, limit: int, offset: int, member: str | None, patients: bool,
+    engine: sa.Engine,
+    words: str,
+    status: str | None,
+    limit: int,
+    offset: int,
+    member: str | None,
+    patients: bool,
     only: str | None = None,
 ) -> tuple[int, list[Case]]:
     """Cases whose accession number, specimen or (for who may see it) patient holds all the words, the latest first.
@@ -129,7 +137,40 @@ def let_out(c: sa.Connection, case: str, person: str) -> None:
     c.execute(db.members.delete().where(db.members.c.case_id == case, db.members.c.person_id == person))
 
 
+def erase(c: sa.Connection, case: str, at: int) -> None:
+    """Takes out all that says something of a case but its events: words, patient, specimen, scans, what jobs found."""
+    of_it = (db.events.c.case_id == case, db.events.c.kind == "erased", db.events.c.refused == "")
+    last = sa.select(sa.func.max(db.events.c.seq)).where(*of_it).scalar_subquery()
+    for table in (db.payloads, db.patients, db.scans, db.blobs, db.members):
+        kept = [table.c.seq < last] if table is db.payloads else []  # the erasure itself tells why
+        c.execute(table.delete().where(table.c.case_id == case, *kept))
+    c.execute(db.invitations.update().where(db.invitations.c.case_id == case).values(name="", revoked=True))
+    ended = {"result": sa.null(), "why": "", "stage": ""}
+    c.execute(db.jobs.update().where(db.jobs.c.case_id == case).values(ended))
+    values = {"accession": f"erased {case[-6:]}", "status": "erased", "specimen": Specimen().model_dump(),
+              "changed_ns": at}  # fmt: skip
+    c.execute(db.cases.update().where(db.cases.c.id == case).values(values))
+
+
+def is_erased(engine: sa.Engine, case: str) -> bool:
+    """Whether a case was erased."""
+    with db.reading(engine) as c:
+        return c.execute(sa.select(db.cases.c.status).where(db.cases.c.id == case)).scalar() == Status.ERASED.value
+
+
 # -------------------------------------------------------------------------------------------------------------- files
+
+
+def drop_files(engine: sa.Engine, blobs: Blobs, hashes: Sequence[str]) -> int:
+    """Removes files that no case has any more; returns how many."""
+    gone = 0
+    for sha256 in set(hashes):
+        with db.reading(engine) as c:
+            used = c.execute(sa.select(db.blobs.c.case_id).where(db.blobs.c.sha256 == sha256).limit(1)).first()
+        if used is None:
+            blobs.remove(sha256)
+            gone += 1
+    return gone
 
 
 def keep_files(blobs: Blobs, files: dict[str, Path]) -> list[ScanFile]:
@@ -184,6 +225,17 @@ def scans_of(engine: sa.Engine, case: str) -> list[ScanInfo]:
                  figures=r.figures)
         for r in rows
     ]  # fmt: skip
+
+
+def lay_out(blobs: Blobs, files: Sequence[ScanFile], data: Path, case: str, scan: str) -> Path:
+    """The folder of a scan under a hub's `data`: each case has its own, so that none can slip a file under another's.
+
+    Raises UsageError for identifiers that would lead elsewhere.
+    """
+    names = case, scan.replace("sha256:", "")[:32]
+    if not all(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9-]*", n) for n in names):
+        raise UsageError(f"case {case[:80]!r}, scan {scan[:80]!r}: needed identifiers")
+    return laid_out(blobs, files, data / LAID_OUT / names[0] / names[1])
 
 
 def laid_out(blobs: Blobs, files: Sequence[ScanFile], folder: Path) -> Path:

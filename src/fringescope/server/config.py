@@ -18,7 +18,7 @@ class Limits:
 
     message_bytes: int = 1_000_000  #: longest message through a room
     body_bytes: int = 4_000_000  #: longest body of a request
-    upload_bytes: int = 2_000_000_000  #: longest bundle
+    upload_bytes: int = 16_000_000_000  #: longest bundle: a scan of full size has about 2 GB
     ops_per_s: float = 40.0  #: ops of one connection, on average
     ops_burst: int = 400  #: and at once, as after a time offline
     live_per_s: float = 120.0  #: pointers, views and ink of one connection
@@ -88,6 +88,7 @@ class Config:
     settings: Settings = field(default_factory=Settings)
     limits: Limits = Limits()
     provider: Provider | None = None
+    checkpoint_s: float = 300.0  #: a signed checkpoint of the log so often, if it has moved
 
     def __post_init__(self) -> None:
         if self.provider is not None and self.host not in LOOPBACK and not self.origins:

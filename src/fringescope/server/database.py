@@ -180,7 +180,8 @@ def open_engine(url: str) -> sa.Engine:
 def _set_up_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # transactions begin where `_begin_at_once` says, not where the driver guesses
     cursor = connection.cursor()
-    for line in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=10000"):
+    for line in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=10000",
+                 "secure_delete=ON"):  # fmt: skip  # what is erased is overwritten
         cursor.execute(f"PRAGMA {line}")
     cursor.close()
 
@@ -205,6 +206,14 @@ def reading(engine: sa.Engine) -> Iterator[sa.Connection]:
     """A transaction that only looks."""
     with engine.connect().execution_options(reads=True) as connection:
         yield connection
+
+
+def forget_erased(engine: sa.Engine) -> None:
+    """SQLite's log ahead may still hold what was erased: it is written back and emptied, if nobody reads just now."""
+    if engine.dialect.name == "sqlite":
+        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as c:
+            connection: Any = c.connection.dbapi_connection
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
 def _alembic(engine: sa.Engine) -> AlembicConfig:

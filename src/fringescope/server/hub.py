@@ -61,7 +61,8 @@ class _Waiting:
     said_ns: int
     refused: str
     answer: asyncio.Future[Said]
-    beside: Callable[[sa.Connection], None] | None = None  #: written in the same transaction
+    beside: Callable[[sa.Connection], None] | None = None  #: written in the same transaction, before the event
+    after: Callable[[sa.Connection], None] | None = None  #: and behind it, as the last of all
 
 
 @dataclass(eq=False)
@@ -69,6 +70,7 @@ class _Batch:
     before: dict[str, Book] = field(default_factory=dict)
     records: list[Record] = field(default_factory=list)
     beside: list[Callable[[sa.Connection], None]] = field(default_factory=list)
+    after: list[Callable[[sa.Connection], None]] = field(default_factory=list)
     folds: list[tuple[_Waiting, Record, truth.Fold]] = field(default_factory=list)
     answers: list[tuple[_Waiting, Said]] = field(default_factory=list)
 
@@ -141,19 +143,20 @@ class Hub:
 
     async def note(
         self, case: str, actor: str, role: str, kind: str, payload: dict[str, Any],
-        beside: Callable[[sa.Connection], None] | None = None,
+        beside: Callable[[sa.Connection], None] | None = None, after: Callable[[sa.Connection], None] | None = None,
     ) -> Said:  # fmt: skip
-        """An event that the hub itself writes down, with what `beside` changes in the same transaction."""
+        """An event that the hub itself writes down, with what `beside` and `after` change in the same transaction."""
         self._numbers += 1
-        return await self._put(case, actor, role, kind, payload, self._run, self._numbers, 0, "", beside)
+        return await self._put(case, actor, role, kind, payload, self._run, self._numbers, 0, "", beside, after)
 
     async def _put(
         self, case: str, actor: str, role: str, kind: str, payload: dict[str, Any], client: str, number: int,
         said_ns: int, refused: str, beside: Callable[[sa.Connection], None] | None = None,
+        after: Callable[[sa.Connection], None] | None = None,
     ) -> Said:  # fmt: skip
         answer: asyncio.Future[Said] = asyncio.get_running_loop().create_future()
         self._queue.put_nowait(
-            _Waiting(case, actor, role, kind, payload, client, number, said_ns, refused, answer, beside)
+            _Waiting(case, actor, role, kind, payload, client, number, said_ns, refused, answer, beside, after)
         )
         return await answer
 
@@ -163,6 +166,26 @@ class Hub:
         """Where a case stands, and after which event."""
         book = await self._book(case)
         return book.truth, book.seq
+
+    async def take_in(self, case: str, write: Callable[[sa.Connection], None]) -> None:
+        """Writes a case that comes from elsewhere, between two batches of words. Raises OutputError and what it raises.
+
+        What was lit or armed there is stopped: nobody watches over it here.
+        """
+
+        def work() -> None:
+            with db.writing(self.engine) as c:
+                write(c)
+
+        await self._in_thread(work)
+        self._books.pop(case, None)
+        book = await self._book(case)
+        if book.truth.exam.guarded or any(v.phase in (Phase.ARMED, Phase.PROJECTING) for v in book.truth.exam.versions):
+            await self.tell(case, GuardLost("the case was brought in from elsewhere"))
+
+    def forget(self, case: str) -> None:
+        """Lets go of what is known of a case; it is read again when somebody asks."""
+        self._books.pop(case, None)
 
     def open_cases(self) -> list[str]:
         """Cases whose truth is at hand: those that anybody has looked at lately."""
@@ -261,6 +284,8 @@ class Hub:
         batch.records.append(record)
         if w.beside is not None and not record.refused:
             batch.beside.append(w.beside)
+        if w.after is not None and not record.refused:
+            batch.after.append(w.after)
         batch.folds.append((w, record, fold))
         said = Said(client=w.client, number=w.number, seq=record.seq, refused=record.refused)
         batch.answers.append((w, said))
@@ -271,6 +296,8 @@ class Hub:
                 for beside in batch.beside:
                     beside(c)
                 journal.append(c, batch.records)
+                for after in batch.after:
+                    after(c)
         except sa.exc.DatabaseError as e:
             raise OutputError(f"the log cannot be written: {e.orig}; nothing was changed") from e
 

@@ -217,10 +217,12 @@ class Instrument:
         problems = tuple(" ".join(p.split())[:190] for p in made["problems"])
         word = Checked(version, v.content, by_name.get("pattern", ""), by_name.get("dashed", ""), problems)
         plain = examination.to_dict(word)
-        await self._hub.note(
+        said = await self._hub.note(
             case, INSTRUMENT, INSTRUMENT, plain.pop("kind"), plain,
             lambda c: cases.insert_files(c, case, f"version-{version}", [f for _, f in files]),
         )  # fmt: skip
+        if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for _, f in files])
 
     async def _guide(self, case: str, scan: str, strokes: list[dict[str, Any]], out: Path) -> Any:
         """The pictures of strokes; once more if somebody ended the workshop for another reason meanwhile."""
@@ -289,9 +291,11 @@ class Instrument:
         told = {"version": effect.version, "pattern": effect.pattern, "shown_ns": shown_ns,
                 "pictures": {f.name: f.sha256 for f in files}}  # fmt: skip
         owner = f"evidence-{shown_ns}"
-        await self._hub.note(
+        said = await self._hub.note(
             case, INSTRUMENT, INSTRUMENT, "evidence", told, lambda c: cases.insert_files(c, case, owner, files)
         )
+        if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
 
     # ----------------------------------------------------------------------------------------------------- what it says
 
@@ -327,6 +331,15 @@ class Instrument:
         self._open = False
         self._why = "the instrument's process ended; it is started again when it is needed"
         self._begin(self._lost("the instrument's process ended"))
+
+    async def forget(self, case: str) -> None:
+        """Nothing of a case stays in the memory of its processes. Raises UsageError while it is projected."""
+        if self._shown is not None and self._shown[0] == case:
+            raise UsageError("a guideline of this case is projected; stop it first")
+        if self._case == case:
+            await self._rest()
+        if self._workshop.alive:
+            self._begin(self._reported(case, self._workshop.call("forget")))  # once it has done what it does
 
     # ---------------------------------------------------------------------------------------------------- being busy
 

@@ -107,6 +107,13 @@ class Jobs:
         task = self._tasks.get(job)
         return task is not None and task.cancel()
 
+    async def cancel_all(self, case: str) -> None:
+        """Ends all jobs of a case, and waits until they have."""
+        tasks = [self._tasks[j.id] for j in list(self._now.values()) if j.case == case and j.id in self._tasks]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
     async def stop(self) -> None:
         """Ends all."""
         tasks = list(self._tasks.values())

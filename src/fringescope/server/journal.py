@@ -1,4 +1,4 @@
-"""The log of all cases on the database: entries in their order, written many at once, read back and checked."""
+"""The log of all cases on the database: entries in their order, written many at once, and read back."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import sqlalchemy as sa
 
 from fringescope.server import database as db
-from fringescope.wire.record import Record, check_chain
+from fringescope.wire.record import Record
 
 _PAGE = 500
 _KEPT = ("case_id", "seq", "at_ns", "said_ns", "actor", "role", "client", "number", "kind", "refused", "digest",
@@ -72,19 +72,3 @@ def heads(engine: sa.Engine) -> dict[str, tuple[int, str]]:
     )
     with db.reading(engine) as c:
         return {r.case_id: (r.seq, r.hash) for r in c.execute(asked)}
-
-
-def check(engine: sa.Engine) -> tuple[int, int, list[str]]:
-    """How many cases and entries there are, and what is wrong with them, a line each."""
-    with db.reading(engine) as c:
-        cases = [r.id for r in c.execute(sa.select(db.cases.c.id).order_by(db.cases.c.id))]
-        strays = c.execute(sa.select(db.events.c.case_id).where(db.events.c.case_id.not_in(cases)).distinct())
-        faults = [f"case {r.case_id}: there are events of it and no case" for r in strays]
-    count = 0
-    for case in cases:
-        seen = list(entries(engine, case))
-        count += len(seen)
-        if not seen:
-            faults.append(f"case {case}: it has no event, not even that it was opened; they were removed")
-        faults += check_chain(seen, case)
-    return len(cases), count, faults

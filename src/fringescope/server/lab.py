@@ -61,31 +61,39 @@ class Lab:
             await self._workshop.kill()
             raise
 
-    async def keep(self, case: str, label: str, folder: Path, doc: dict[str, Any]) -> dict[str, Any]:
-        """A scan's folder into the case: its files first, then one transaction with the event."""
+    async def keep(
+        self, case: str, label: str, folder: Path, doc: dict[str, Any], taken_ns: int | None = None,
+        present: bool = True,
+    ) -> dict[str, Any]:  # fmt: skip
+        """A scan's folder into the case: its files first, then one transaction with the event.
+
+        Without `present` it is there to look at, and the case stays at the scan that it has.
+        """
         named = {str(p.relative_to(folder)): p for p in sorted(folder.rglob("*")) if p.is_file()}
         files: list[ScanFile] = await asyncio.to_thread(cases.keep_files, self._blobs, named)
         kept = ("figures", "views", "cloud", "surface", "created", "instrument")
         info = ScanInfo(
-            id=doc["hash"], case=case, rig=doc["rig"], label=label, taken_ns=self._hub.clock.now_ns(), files=files,
-            figures={k: doc[k] for k in kept if k in doc},
+            id=doc["hash"], case=case, rig=doc["rig"], label=label, taken_ns=taken_ns or self._hub.clock.now_ns(),
+            files=files, figures={k: doc[k] for k in kept if k in doc},
         )  # fmt: skip
         truth, _ = await self._hub.truth_of(case)
-        if truth.exam.rig not in ("", doc["rig"]):
+        if present and truth.exam.rig not in ("", doc["rig"]):
             await self._hub.tell(case, RigChanged(doc["rig"]))
         word = {"scan": info.id, "rig": info.rig, "label": label, "files": len(files)}
         said = await self._hub.note(
-            case, INSTRUMENT, INSTRUMENT, ScanTaken.__name__, word,
+            case, INSTRUMENT, INSTRUMENT, ScanTaken.__name__ if present else "evidence", word,
             lambda c: cases.insert_scan(c, info),
         )  # fmt: skip
         if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
             raise UsageError(said.refused)
         if truth.exam.lost:
             for device in truth.exam.lost:
                 await self._hub.tell(case, DeviceBack(device))
-        task = asyncio.create_task(self._prepare(case, info.id))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        if present:
+            task = asyncio.create_task(self._prepare(case, info.id))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
         return {"scan": info.id, "seq": said.seq}
 
     async def _prepare(self, case: str, scan: str) -> None:
@@ -133,6 +141,7 @@ class Lab:
             lambda c: cases.insert_files(c, case, owner, files),
         )  # fmt: skip
         if said.refused:
+            await asyncio.to_thread(cases.drop_files, self._hub.engine, self._blobs, [f.sha256 for f in files])
             raise UsageError(said.refused)
         kept = ("words", "registration", "change", "guidelines", "specimen")
         return {"owner": owner, **{k: doc[k] for k in kept if k in doc}}

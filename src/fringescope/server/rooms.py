@@ -17,6 +17,7 @@ TOO_SLOW = (1013, "you read too slowly; come back with the number of the last ev
 EXPELLED = (4403, "your right to see this case has ended")
 FLOOD = (1008, "too many messages at once; come back, and say less")
 SIGNED_OUT = (4401, "you are not signed in any more; sign in and come back")
+ERASED = (4410, "this case was erased")
 OVER = (1012, "the hub stops; come back")
 
 
@@ -56,6 +57,12 @@ class Listener:
             self.ended = why
             self._lines.clear()
             self._live.clear()
+        self._wake.set()
+
+    def end_soon(self, why: tuple[int, str]) -> None:
+        """No more messages after those that wait."""
+        if self.ended is None:
+            self.ended = why
         self._wake.set()
 
     async def next(self) -> list[str]:
@@ -135,6 +142,11 @@ class Rooms:
             for listener in room:
                 if listener.session in ended:
                     listener.end(SIGNED_OUT)
+
+    def close(self, case: str, why: tuple[int, str]) -> None:
+        """Closes one room, once everybody in it has been sent what waits for them."""
+        for listener in self._rooms.get(case, ()):
+            listener.end_soon(why)
 
     def end(self) -> None:
         """Closes all."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import re
 from collections.abc import MutableMapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,6 +26,7 @@ _HEADERS = {
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
 _SAFE = ("GET", "HEAD", "OPTIONS")
+_UPLOADS = re.compile(r"/api/cases/(import|[^/]+/scans/import)")
 _FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "x-cluster-client-ip", "true-client-ip", "cf-ray",
               "cf-connecting-ip", "fastly-client-ip", "x-original-host", "x-arr-log-id")  # fmt: skip
 
@@ -118,7 +120,7 @@ class Guarded:
             await _refuse(sent, 403, "this request comes from another site's page; open the hub's own page")
             return
         limits = self._config.limits
-        longest = limits.upload_bytes if scope["path"] == "/api/cases/import" else limits.body_bytes
+        longest = limits.upload_bytes if _UPLOADS.fullmatch(scope["path"]) else limits.body_bytes
         length = headers.get("content-length", "0")
         if not (length.isascii() and length.isdigit() and len(length) < 20) or int(length) > longest:
             await _refuse(sent, 413, f"a body of {length[:20]} bytes; at most {longest} are taken")

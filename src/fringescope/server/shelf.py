@@ -67,5 +67,4 @@ class Shelf:
         files = (await asyncio.to_thread(cases.files_of, self._engine, case, scan)).get(scan)
         if not files:
             raise UsageError(f"case {case} has no scan {scan[:19]}; scan again")
-        folder = self.data / "laid-out" / scan.replace("sha256:", "")[:32]
-        return await asyncio.to_thread(cases.laid_out, self._blobs, files, folder)
+        return await asyncio.to_thread(cases.lay_out, self._blobs, files, self.data, case, scan)

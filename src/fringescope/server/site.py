@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from fringescope.server import database as db
 from fringescope.server import journal
 from fringescope.server.accounts import Accounts
 from fringescope.server.blobs import Blobs
+from fringescope.server.checkpoints import Checkpoints
 from fringescope.server.clock import Clock
 from fringescope.server.config import Config
 from fringescope.server.hub import Hub
@@ -21,6 +23,7 @@ from fringescope.server.instrument import Instrument
 from fringescope.server.invitations import Invitations
 from fringescope.server.jobs import Jobs
 from fringescope.server.lab import Lab
+from fringescope.server.leaving import Leaving, finish_erasures
 from fringescope.server.openid import OpenId
 from fringescope.server.passkeys import Passkeys
 from fringescope.server.processes.parent import Child
@@ -49,6 +52,8 @@ class Site:
     ops: Throttle
     passkeys: Passkeys
     provider: OpenId | None
+    checkpoints: Checkpoints
+    leaving: Leaving
     lock: int
 
     def close(self) -> None:
@@ -85,23 +90,27 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         engine = db.open_engine(config.url)
         undo.callback(engine.dispose)
         db.migrate(engine)
+        shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         clock = Clock(journal.last_ns(engine))
         blobs = Blobs(config.data / "files")
+        finish_erasures(config.data, engine, blobs)
         limits = config.limits
         accounts = Accounts(engine, clock, limits, hasher)
         rooms = Rooms(limits.waiting)
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
+        checkpoints = Checkpoints(engine, clock, config.data)
         accounts.gone = rooms.expel
         shelf, workshop = Shelf(config.data, engine, blobs, config.rig), Child("fringescope.server.processes.workshop")
         instrument = Instrument(hub, blobs, shelf, workshop, config)
+        lab = Lab(hub, blobs, shelf, instrument, workshop, config)
         site = Site(
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
-            instrument, Lab(hub, blobs, shelf, instrument, workshop, config),
-            Throttle(limits.requests_per_s, limits.requests_burst),
+            instrument, lab, Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
             Throttle(limits.ops_per_s, limits.ops_burst), Passkeys(engine, clock, accounts),
-            None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), lock,
+            None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), checkpoints,
+            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock,
         )  # fmt: skip
         undo.pop_all()
     return site

@@ -31,6 +31,7 @@ from fringescope.types.examination import (
 )
 from fringescope.wire.record import Record, canonical
 
+ERASED = "the case was erased; open another"
 MOST = 5000  #: strokes, layers or comments of a case
 
 Item = tuple[str, str]  #: ("stroke" | "layer" | "comment", identifier)
@@ -58,6 +59,7 @@ class Truth:
     signatures: tuple[Mapping[str, Any], ...] = ()
     scans: tuple[str, ...] = ()
     erased: bool = False
+    brought: int = 0  #: versions up to this number were checked on another instrument: not to be shown on this one
 
     def of_kind(self, kind: str) -> dict[str, Mapping[str, Any]]:
         """The strokes, layers or comments, by identifier."""
@@ -87,8 +89,10 @@ def content_of_stroke(document: Mapping[str, Any], meaning: str) -> str:
 def follow(truth: Truth, r: Record, settings: ExaminationSettings | None = None) -> Fold:
     """The truth after an event. Never raises for what an event says: see `Fold.refused`."""
     payload = dict(r.payload or {})
-    if truth.erased or (r.payload is None):
-        return Fold(truth, payload, refused=r.refused or "the case was erased; open another")
+    if truth.erased:
+        return Fold(truth, {}, refused=r.refused or ERASED)  # what comes too late is not kept
+    if r.payload is None:
+        return Fold(truth, payload, refused=r.refused or ERASED)
     try:
         return _follow(truth, r, payload, settings or ExaminationSettings())
     except _NoError as e:
@@ -116,10 +120,17 @@ def _follow(truth: Truth, r: Record, payload: dict[str, Any], s: ExaminationSett
             return _undo(truth, r, payload, s)
         case "sign":
             return _sign(truth, r, payload)
-        case "preview" | "opened" | "changed" | "invited" | "revoked" | "joined" | "evidence" | "imported":
+        case "preview" | "arm" | "start" if payload["version"] <= truth.brought:
+            raise _NoError(f"version {payload['version']} was checked on another instrument; submit its strokes anew")
+        case "preview" | "opened" | "changed" | "invited" | "revoked" | "joined":
             return Fold(truth, payload)
+        case "evidence":  # may name a scan that is not the present one
+            more = (payload["scan"],) if "scan" in payload else ()
+            return Fold(replace(truth, scans=(*truth.scans, *more)), payload)
+        case "imported":
+            return Fold(replace(truth, brought=len(truth.exam.versions)), payload)
         case "erased":
-            return Fold(replace(truth, items={}, done={}, versions={}, erased=True), payload)
+            return Fold(Truth(erased=True), {**payload, "through": r.seq - 1})
         case _:
             return _word(truth, r, payload, s)
 

@@ -315,6 +315,21 @@ class AuditReport(_Document):
     events: int
     faults: list[str]
     whole: bool
+    checkpoints: int = 0
+    covered_ns: int = 0  #: until then a tail that was cut off would have been missed
+
+
+class AskedErasure(_Document):
+    """A case to erase, and why: a request, a rule, the end of a study."""
+
+    why: Annotated[str, Field(min_length=1, max_length=500, pattern=r"^[^\x00-\x1f\x7f]+$")]
+
+
+class Erased(_Document):
+    """A case was erased: so many events lost their words, so many files are gone."""
+
+    events: int
+    files: int
 
 
 class Health(_Document):

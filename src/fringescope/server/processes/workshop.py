@@ -66,6 +66,11 @@ def prepare(call: Call, scan: str, rig: str, settings: str) -> None:
     call.check()
 
 
+def forget(_call: Call) -> None:
+    """Lets go of the scans that were made ready."""
+    _tissue.cache_clear()
+
+
 def guide(call: Call, scan: str, rig: str, settings: str, strokes: list[dict[str, Any]], out: str) -> dict[str, Any]:
     """Strokes to pattern.png, dashed.png, pattern.json and a preview for each camera, in folder `out`.
 
@@ -188,6 +193,7 @@ class Hand:
     def __init__(self, _emit: Callable[[dict[str, Any]], None]) -> None:
         self.calls: dict[str, Callable[..., Any]] = {
             "reconstruct": reconstruct, "prepare": prepare, "guide": guide, "carry": carry, "photographs": photographs,
+            "forget": forget,
             "compare": compare, "calibrate": calibrate,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {}
