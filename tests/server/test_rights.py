@@ -37,6 +37,7 @@ class Row:
     body: Any = None
     other: dict[str, int] = field(default_factory=dict)
     ends: bool = False  #: ends the session that asks
+    fresh: bool = False  #: ends the case that it is asked of
 
     def expected(self, role: str) -> int:
         if role in self.other:
@@ -100,6 +101,10 @@ ROUTES: dict[str, Row] = {
     "POST /api/instrument/calibrate": Row("operator", 202),
     "POST /api/instrument/simulate": Row("operator", 503, {"move": "1,0,0"}),
     "GET /api/audit": Row("admin", 200),
+    "GET /api/cases/{case}/bundle": Row(DRAW, 200),
+    "POST /api/cases/import": Row("operator", 400, {}),
+    "POST /api/cases/{case}/scans/import": Row("operator", 202, {}),
+    "POST /api/cases/{case}/erase": Row("admin", 200, {"why": "asked for"}, fresh=True),
 }
 SOCKETS = {"/api/cases/{case}/room": ALL, "/api/cases/{case}/video/{camera}": TALK}
 
@@ -172,7 +177,8 @@ def filled(world: World, path: str, case: str) -> str:
 @pytest.mark.parametrize("route", ROUTES)
 def test_every_route_by_everybody(world: World, route: str) -> None:
     row, (method, path) = ROUTES[route], route.split()
-    path = filled(world, path, world.case.id)
+    case = world.client("operator").open_case("S26-fresh").id if row.fresh else world.case.id
+    path = filled(world, path, case)
     if route == "DELETE /api/cases/{case}/members/{person}":
         path = path.rsplit("/", 1)[0] + "/person-0"
     found = {}
