@@ -199,5 +199,7 @@ def laid_out(blobs: Blobs, files: Sequence[ScanFile], folder: Path) -> Path:
         try:
             os.link(blobs.path(f.sha256), target)
         except OSError:
-            shutil.copyfile(blobs.path(f.sha256), target)
+            half = target.with_name(f"{target.name}.{os.getpid()}.half")  # whole or not at all, whenever we are killed
+            shutil.copyfile(blobs.path(f.sha256), half)
+            half.replace(target)
     return folder

@@ -29,6 +29,7 @@ class Limits:
     session_s: float = 12 * 3600.0  #: a session ends after
     idle_s: float = 3600.0  #: or after so long without a request
     waiting: int = 4000  #: messages that wait for a browser that does not read before it is let go
+    waiting_letters: int = 16_000_000  #: and how long they may be together
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
 

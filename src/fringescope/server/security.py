@@ -76,7 +76,7 @@ class Guarded:
         limits = self._config.limits
         longest = limits.upload_bytes if scope["path"] == "/api/cases/import" else limits.body_bytes
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > longest:
+        if not (length.isascii() and length.isdigit()) or int(length) > longest:
             await _refuse(sent, 413, f"a body of {length[:20]} bytes; at most {longest} are taken")
             return
         count = 0

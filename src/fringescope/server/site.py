@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +75,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
     lock = hold(config)
     with contextlib.ExitStack() as undo:
         undo.callback(os.close, lock)
+        shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         engine = db.open_engine(config.url)
         undo.callback(engine.dispose)
         db.migrate(engine)
@@ -81,7 +83,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         blobs = Blobs(config.data / "files")
         limits = config.limits
         accounts = Accounts(engine, clock, limits, hasher)
-        rooms = Rooms(limits.waiting)
+        rooms = Rooms(limits.waiting, limits.waiting_letters)
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
         accounts.gone = rooms.expel

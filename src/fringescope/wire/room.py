@@ -55,7 +55,7 @@ class Ping(_Message):
     """Is anybody there?"""
 
     type: Literal["ping"] = "ping"
-    at_ms: float = 0
+    at_ms: Annotated[float, Field(allow_inf_nan=False)] = 0
 
 
 Ephemeral = Pointer | View | Ink
