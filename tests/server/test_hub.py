@@ -9,8 +9,9 @@ import pytest
 from fringescope.client import Client, HubCase, HubError
 from fringescope.server.running import Server
 from fringescope.types.examination import RigChanged, ScanTaken
-from tests.server.conftest import PASSWORD, SignIn
+from tests.server.conftest import PASSWORD, SignIn, both
 
+pytestmark = both
 SCAN, RIG = "sha256:" + "a" * 64, "sha256:" + "b" * 64
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import argon2
+import sqlalchemy as sa
 
 from fringescope.errors import OutputError
 from fringescope.server import database as db
@@ -43,9 +44,12 @@ class Site:
     logins: Throttle
     ops: Throttle
     lock: int
+    database_lock: sa.Connection | None
 
     def close(self) -> None:
         """Lets go of the data folder and the database."""
+        if self.database_lock is not None:
+            self.database_lock.close()
         self.engine.dispose()
         os.close(self.lock)
 
@@ -78,6 +82,9 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         engine = db.open_engine(config.url)
         undo.callback(engine.dispose)
+        database_lock = db.hold(engine)
+        if database_lock is not None:
+            undo.callback(database_lock.close)
         db.migrate(engine)
         clock = Clock(journal.last_ns(engine))
         blobs = Blobs(config.data / "files")
@@ -91,7 +98,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
             Instrument(hub, blobs, config), Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
-            Throttle(limits.ops_per_s, limits.ops_burst), lock,
+            Throttle(limits.ops_per_s, limits.ops_burst), lock, database_lock,
         )  # fmt: skip
         undo.pop_all()
     return site

@@ -193,7 +193,7 @@ def _undo(truth: Truth, r: Record, payload: dict[str, Any], s: ExaminationSettin
             raise _NoError("nothing of yours is left to undo")
     done = truth.done.get(of)
     if done is None:
-        raise _NoError(f"event {of} is none that can be undone; strokes, layers and comments of the last {UNDOABLE} ops can")
+        raise _NoError(f"event {of} cannot be undone; strokes, layers and comments of the last {UNDOABLE} ops can")
     if done.actor != r.actor:
         raise _NoError(f"event {of} is {done.actor}'s; only its author undoes it")
     if done.undone:
