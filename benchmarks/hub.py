@@ -288,7 +288,8 @@ def main() -> None:
     if given.serve is not None:
         serve(given.serve, given.database)
         return
-    with tempfile.TemporaryDirectory(prefix="fringescope-bench-") as name, hub(Path(name), given.database) as (url, pid):
+    made = tempfile.TemporaryDirectory(prefix="fringescope-bench-")
+    with made as name, hub(Path(name), given.database) as (url, pid):
         people = {role: Client(url, role, PASSWORD) for role in ("operator", "expert", "observer")}
         case = people["operator"].case(CASE)
         for role in ("expert", "observer"):
@@ -314,8 +315,9 @@ def main() -> None:
     print(f"  ink: {ink['p50'] / found['bare_ms']:.1f} times there and back through a bare socket")
     print(f"{given.clients} clients, {given.drawing} drawing, {found['seconds']} s, {found['events']} events: "
           f"{found['lost']} lost, {found['doubled']} doubled, the same log for all: {found['same_log']}")  # fmt: skip
-    print(f"stroke {stroke['p50']} ms, 99 %: {stroke['p99']}, longest {stroke['max']}; "
-          f"ink {ink['p50']} ms, 99 %: {ink['p99']}, longest {ink['max']}, seen {100 * found['ink_seen_share']:.1f} %")  # fmt: skip
+    print(f"stroke {stroke['p50']} ms, 99 %: {stroke['p99']}, longest {stroke['max']}")
+    seen = 100 * found["ink_seen_share"]
+    print(f"ink {ink['p50']} ms, 99 %: {ink['p99']}, longest {ink['max']}, seen {seen:.1f} %")
     print(f"hub: {100 * found['hub_cpu_share']:.0f} % of a core, {memory[0]} MB before, {memory[len(memory) // 5]} MB "
           f"after a fifth, {memory[-1]} MB at the end")  # fmt: skip
 

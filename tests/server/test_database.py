@@ -108,7 +108,7 @@ def test_many_at_once_get_one_order(hub: Server, sign_in: SignIn) -> None:
         t.start()
     for t in threads:
         t.join()
-    for n, case in enumerate(cases):
+    for n in range(3):
         given = sorted(s for k in (n, n + 3) for s in answers[k] if s is not None)
         assert given == list(range(4, 24))
     cases_, count, faults = journal.check(hub.site.engine)

@@ -1,4 +1,4 @@
-"""A hub killed in the middle of its work: what it acknowledged is there, what it did not is done once when said again."""
+"""A hub killed in the middle of its work: what it acknowledged is there; what it did not, said again, is done once."""
 
 from __future__ import annotations
 

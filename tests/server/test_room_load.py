@@ -69,7 +69,7 @@ def test_a_stroke_is_seen_within_50_ms(root: Path, record_property: Any) -> None
 @pytest.mark.verify
 @pytest.mark.parametrize("clients", [50, 200])
 def test_a_crowd_for_five_minutes(root: Path, clients: int, record_property: Any) -> None:
-    """1,200 strokes of 100 points; what the hub keeps of them to undo is bounded, and most of it is there at the end."""
+    """1,200 strokes of 100 points; what the hub keeps of them to undo is bounded, and nearly all there at the end."""
     rate = "30" if clients < 100 else "15"
     found = crowd(root, "--clients", str(clients), "--seconds", "300", "--rate", rate, record=record_property)
     holds(found)

@@ -32,7 +32,7 @@ from fringescope.types.examination import (
 from fringescope.wire.record import Record, canonical
 
 MOST = 5000  #: strokes, layers or comments of a case
-UNDOABLE = 1000  #: the latest ops of a case that can be taken back; a case that goes on for days stays as small
+UNDOABLE = 500  #: the latest ops of a case that can be taken back; a case that goes on for days stays as small
 
 Item = tuple[str, str]  #: ("stroke" | "layer" | "comment", identifier)
 
