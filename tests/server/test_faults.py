@@ -227,14 +227,8 @@ def test_a_browser_that_stops_reading_is_let_go(tmp_path: Path) -> None:
             deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 100_000)
             cookies = "; ".join(f"{c.name}={c.value}" for c in operator.http.cookies.jar)
             url = f"ws://127.0.0.1:{hub.config.port}/api/cases/{case.id}/room"
-            opened = connect(
-                url,
-                sock=deaf,
-                additional_headers={"Cookie": cookies},
-                compression=None,
-                max_queue=1,
-                ping_interval=None,
-            )
+            me = {"Cookie": cookies}
+            opened = connect(url, sock=deaf, additional_headers=me, compression=None, max_queue=1, ping_interval=None)
             with opened as stuck, case.enter() as room:
                 stuck.recv()
                 assert hub.site.rooms.count(case.id) == 2

@@ -25,14 +25,13 @@ def cookie_of(tls: bool) -> str:
 
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
-    """What may go wrong with a route, for its description."""
+    """What may go wrong with a route, for its description: what is named, and what may befall any."""
     words = {
         400: "the request makes no sense as it stands", 401: "nobody is signed in", 403: "not for this role",
         404: "there is none", 409: "not now", 410: "it was erased", 413: "too long", 416: "no such range",
-        422: "the request is not what is described here", 429: "too often", 503: "the instrument does not answer",
-        507: "the disk is full",
+        422: "the request is not what is described here", 429: "too often", 507: "the disk is full",
     }  # fmt: skip
-    return {c: {"model": Problem, "description": words[c]} for c in (*codes, 422, 429)}
+    return {c: {"model": Problem, "description": words[c]} for c in sorted({*codes, 400, 403, 413, 422, 429, 507})}
 
 
 def site_of(request: Request) -> Site:
