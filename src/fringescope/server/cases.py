@@ -170,9 +170,9 @@ def insert_scan(c: sa.Connection, scan: ScanInfo) -> None:
 
 def scans_of(engine: sa.Engine, case: str) -> list[ScanInfo]:
     """The scans of a case, in the order in which they were taken."""
-    files = files_of(engine, case)
     with db.reading(engine) as c:
         rows = list(c.execute(sa.select(db.scans).where(db.scans.c.case_id == case).order_by(db.scans.c.taken_ns)))
+    files = files_of(engine, case)  # behind the scans: each came together with its files
     return [
         ScanInfo(id=r.id, case=case, rig=r.rig, label=r.label, taken_ns=r.taken_ns, files=files.get(r.id, []),
                  figures=r.figures)
