@@ -133,9 +133,14 @@ def test_a_stop_on_a_full_disk_is_dark_at_once_and_written_down_later(
             room.stop("it moves")
         assert len(without_instrument) == 1
         monkeypatch.undo()
-        v = room.wait(1, "stopped", "previewed", "checked", timeout_s=10)
-        assert v.phase != "projecting"
-        assert [e.kind for e in room.events][-1] in ("GuardLost", "Expired")
+        for _ in range(20):  # the camera still finds all as it was: it is not for want of a verdict that it ends
+            told(hub, case, Watched(SCAN, Standing.VALID))
+            if room.version(1).phase != "projecting":
+                break
+            time.sleep(0.2)
+        assert room.version(1).phase != "projecting"
+        assert "GuardLost" in [e.kind for e in room.events]
+        assert "Expired" not in [e.kind for e in room.events]
 
 
 def test_a_file_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
