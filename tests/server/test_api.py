@@ -194,5 +194,5 @@ def test_the_api_does_what_it_says(world: World) -> None:
 @pytest.mark.verify
 @pytest.mark.parametrize("world", ["sqlite", "postgres"], indirect=True)
 def test_the_api_does_what_it_says_at_length(world: World) -> None:
-    everything(world, 150)
+    everything(world, 40)
     judged(world)
