@@ -69,6 +69,7 @@ NOT_UNDERSTOOD = {
     "the hub's word": say({"kind": "erased", "through": 99}),
     "somebody else's name": say(COMMENT)[:-2] + ', "actor": "p"}}',
     "a further field": say(COMMENT, seq=1),
+    "a further field of two lines": say(COMMENT, **{"a\n\x00b": 1}),
     "a further field inside": say({**COMMENT, "author": "somebody"}),
     "deep lists": "[" * 100_000,
     "deep objects": '{"a":' * 50_000 + "1" + "}" * 50_000,

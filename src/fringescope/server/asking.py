@@ -34,6 +34,11 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {c: {"model": Problem, "description": words[c]} for c in sorted({*codes, 400, 403, 413, 422, 429, 507})}
 
 
+def one_line(text: str, most: int = 300) -> str:
+    """A sentence that somebody's own words are part of: on one line, and not too long."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:most]
+
+
 def site_of(request: Request) -> Site:
     """The hub's parts."""
     site: Site = request.app.state.site

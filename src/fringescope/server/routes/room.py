@@ -18,7 +18,7 @@ from fringescope.errors import DeviceError, FringescopeError
 from fringescope.server import database as db
 from fringescope.server import journal, truth
 from fringescope.server.accounts import SignInError
-from fringescope.server.asking import Asking, asking_of, may_see
+from fringescope.server.asking import Asking, asking_of, may_see, one_line
 from fringescope.server.hub import as_event
 from fringescope.server.rights import refusal
 from fringescope.server.rooms import EXPELLED, Listener
@@ -209,7 +209,7 @@ def _refused(why: str) -> str:
 def _why(e: ValidationError) -> str:
     first = e.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(x) for x in first["loc"])
-    return f"a message that nobody understands: {where + ': ' if where else ''}{first['msg']}"[:300]
+    return one_line(f"a message that nobody understands: {where + ': ' if where else ''}{first['msg']}")
 
 
 # -------------------------------------------------------------------------------------------------------------- video
