@@ -126,7 +126,6 @@ def test_a_signature_needs_the_password_once_more(hub: Server, sign_in: SignIn) 
     with case.enter() as room:
         room.draw(stroke("s"))
         version = room.submit()
-        hub.site.engine.dispose()
         with hub.site.engine.begin() as c:
             c.exec_driver_sql("UPDATE sessions SET confirmed_ns = 0")
         with pytest.raises(HubError, match="password once more"):

@@ -219,6 +219,7 @@ def hold(engine: sa.Engine) -> sa.Connection | None:
         connection = engine.connect().execution_options(isolation_level="AUTOCOMMIT")
     except sa.exc.OperationalError as e:
         raise OutputError(f"the database cannot be reached: {' '.join(str(e.orig).split())}; is it there?") from e
+    connection.detach()  # it is no part of the pool: when it is closed the lock is gone
     if not connection.execute(sa.select(sa.func.pg_try_advisory_lock(_HELD))).scalar():
         connection.close()
         raise OutputError("another hub runs on this database; stop it first, or give this one a database of its own")
