@@ -6,13 +6,14 @@
 #   make, git        the tasks; tests that look at the tracked files
 #   nodejs, npm      Khronos' glTF validator, which judges surface.glb; checks of the viewer page's script
 #   poppler-utils    prints board.pdf to a picture, as an outside reader of it
+#   postgresql       the hub's tests on PostgreSQL, which start a server of their own
 #   chromium         opens the viewer page without a screen and looks whether it draws
 #
 # A package that cannot be had costs only the tests that need it; they are skipped and say so by name.
 set -uo pipefail
 
 if ! command -v apt-get >/dev/null; then
-  echo "system packages: no apt-get here; install by hand what you miss: python3-venv make git nodejs npm poppler-utils chromium"
+  echo "system packages: no apt-get here; install by hand what you miss: python3-venv make git nodejs npm poppler-utils chromium postgresql"
   exit 0
 fi
 wanted=()
@@ -23,6 +24,7 @@ command -v node >/dev/null || wanted+=(nodejs)
 command -v npm >/dev/null || wanted+=(npm)
 command -v pdftoppm >/dev/null || wanted+=(poppler-utils)
 command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || wanted+=(chromium)
+command -v initdb >/dev/null || compgen -G "/usr/lib/postgresql/*/bin/initdb" >/dev/null || wanted+=(postgresql)
 if [ ${#wanted[@]} -eq 0 ]; then
   echo "system packages: all there"
   exit 0

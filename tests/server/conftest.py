@@ -13,15 +13,37 @@ from fringescope.client import Client
 from fringescope.server.config import Config
 from fringescope.server.running import Server
 from fringescope.wire import PersonRole
+from tests.server.postgres import Cluster
 
+#: for tests that hold whatever the database is
+both = pytest.mark.parametrize("hub", ["sqlite", "postgres"], indirect=True)
 PASSWORD = "correct horse battery"  # of everybody in these tests
 DEVICE = "sim://paper/tissue-domed?scale=0.06&seed=3"
 
 
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Cluster]:
+    """A PostgreSQL server; skipped by name where there is none."""
+    made = Cluster()
+    yield made
+    made.close()
+
+
+def database(request: pytest.FixtureRequest) -> str | None:
+    """The URL of an empty database, of the kind that a test was parametrised with; None for SQLite in the folder."""
+    if getattr(request, "param", "sqlite") == "sqlite":
+        return None
+    url: str = request.getfixturevalue("cluster").new()
+    return url
+
+
 @pytest.fixture
-def hub(tmp_path: Path) -> Iterator[Server]:
-    """A hub without an instrument; somebody of each role has an account, by the name of the role."""
-    with Server(Config(tmp_path / "hub", port=0), fast_passwords=True) as server:
+def hub(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Server]:
+    """A hub without an instrument; somebody of each role has an account, by the name of the role.
+
+    On SQLite, or as in `@both`.
+    """
+    with Server(Config(tmp_path / "hub", port=0, database=database(request)), fast_passwords=True) as server:
         populate(server)
         yield server
 

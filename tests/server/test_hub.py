@@ -9,8 +9,9 @@ import pytest
 from fringescope.client import Client, HubCase, HubError
 from fringescope.server.running import Server
 from fringescope.types.examination import RigChanged, ScanTaken
-from tests.server.conftest import PASSWORD, SignIn
+from tests.server.conftest import PASSWORD, SignIn, both
 
+pytestmark = both
 SCAN, RIG = "sha256:" + "a" * 64, "sha256:" + "b" * 64
 
 
@@ -85,6 +86,10 @@ def test_undo_takes_back_and_undo_of_undo_does_it_again(hub: Server, sign_in: Si
         room.remove("s")
         room.undo()
         assert "s" in case.state().strokes
+        room.undo()  # and again: one step further back each time
+        room.undo()
+        assert "s" not in case.state().strokes
+        room.draw(stroke("s", 5.0))
         room.comment("look here", stroke="s")
         room.undo()
         assert not case.state().comments
@@ -125,7 +130,6 @@ def test_a_signature_needs_the_password_once_more(hub: Server, sign_in: SignIn) 
     with case.enter() as room:
         room.draw(stroke("s"))
         version = room.submit()
-        hub.site.engine.dispose()
         with hub.site.engine.begin() as c:
             c.exec_driver_sql("UPDATE sessions SET confirmed_ns = 0")
         with pytest.raises(HubError, match="password once more"):

@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException as RawHTTPException
 
 from fringescope import __version__
 from fringescope.errors import FringescopeError, OutputError
+from fringescope.server.asking import one_line
 from fringescope.server.config import Config
 from fringescope.server.routes import audit, cases, leaving, passkeys, people, room, scans, signing
 from fringescope.server.security import Guarded
@@ -86,8 +87,7 @@ def _explain(app: FastAPI) -> None:
         for one in e.errors()[:5]:
             where = ".".join(str(x) for x in one["loc"][1:]) or str(one["loc"][0])
             said.append(f"{where}: {one['msg']}")
-        told = "; ".join(said)[:1000].encode(errors="replace").decode()  # a key may hold half a letter
-        return JSONResponse({"detail": told}, 422)
+        return JSONResponse({"detail": one_line("; ".join(said), 1000)}, 422)
 
     @app.exception_handler(OutputError)
     async def unwritten(_request: Request, e: OutputError) -> JSONResponse:

@@ -42,15 +42,20 @@ def secret_of(request: HTTPConnection, config: Config) -> str:
 
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
-    """What may go wrong with a route, for its description."""
+    """What may go wrong with a route, for its description: what is named, and what may befall any."""
     words = {
         400: "the request makes no sense as it stands", 401: "nobody is signed in", 403: "not for this role",
         404: "there is none", 409: "not now", 410: "it was erased", 413: "too long", 416: "no such range",
-        422: "the request is not what is described here", 429: "too often", 503: "the instrument does not answer",
-        507: "the disk is full",
+        422: "the request is not what is described here", 429: "too often", 507: "the disk is full",
     }  # fmt: skip
     more = (410,) if 404 in codes else ()  # of what was there, but was erased
-    return {c: {"model": Problem, "description": words[c]} for c in (*codes, *more, 422, 429)}
+    often = {400, 403, 413, 422, 429, 507}
+    return {c: {"model": Problem, "description": words[c]} for c in sorted({*codes, *more, *often})}
+
+
+def one_line(text: str, most: int = 300) -> str:
+    """A sentence that somebody's own words are part of: on one line, and not too long."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:most]
 
 
 def site_of(request: Request) -> Site:

@@ -217,9 +217,9 @@ def insert_scan(c: sa.Connection, scan: ScanInfo) -> None:
 
 def scans_of(engine: sa.Engine, case: str) -> list[ScanInfo]:
     """The scans of a case, in the order in which they were taken."""
-    files = files_of(engine, case)
     with db.reading(engine) as c:
         rows = list(c.execute(sa.select(db.scans).where(db.scans.c.case_id == case).order_by(db.scans.c.taken_ns)))
+    files = files_of(engine, case)  # behind the scans: each came together with its files
     return [
         ScanInfo(id=r.id, case=case, rig=r.rig, label=r.label, taken_ns=r.taken_ns, files=files.get(r.id, []),
                  figures=r.figures)
@@ -257,5 +257,7 @@ def laid_out(blobs: Blobs, files: Sequence[ScanFile], folder: Path) -> Path:
         try:
             os.link(blobs.path(f.sha256), target)
         except OSError:
-            shutil.copyfile(blobs.path(f.sha256), target)
+            half = target.with_name(f"{target.name}.{os.getpid()}.half")  # whole or not at all, whenever we are killed
+            shutil.copyfile(blobs.path(f.sha256), half)
+            half.replace(target)
     return folder

@@ -33,6 +33,7 @@ class Limits:
     messages_per_s: float = 600.0  #: messages of any kind of one connection, before it is closed
     messages_burst: int = 4000
     waiting: int = 4000  #: messages that wait for a browser that does not read before it is let go
+    waiting_letters: int = 16_000_000  #: and how long they may be together
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
 

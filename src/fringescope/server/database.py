@@ -156,6 +156,7 @@ jobs = sa.Table(
     sa.Column("ended_ns", Big),
 )  # fmt: skip
 
+_HELD = 0x6672696E67650001  #: the number of our lock among a database's advisory ones
 MIGRATIONS = Path(__file__).with_name("migrations")
 
 
@@ -214,6 +215,24 @@ def forget_erased(engine: sa.Engine) -> None:
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as c:
             connection: Any = c.connection.dbapi_connection
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+
+def hold(engine: sa.Engine) -> sa.Connection | None:
+    """Takes hold of a database that others can reach, one hub at a time, until the connection is closed.
+
+    None for SQLite, which lies in a folder that is held. Raises OutputError if another hub has it.
+    """
+    if engine.dialect.name == "sqlite":
+        return None
+    try:
+        connection = engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+    except sa.exc.OperationalError as e:
+        raise OutputError(f"the database cannot be reached: {' '.join(str(e.orig).split())}; is it there?") from e
+    connection.detach()  # it is no part of the pool: when it is closed the lock is gone
+    if not connection.execute(sa.select(sa.func.pg_try_advisory_lock(_HELD))).scalar():
+        connection.close()
+        raise OutputError("another hub runs on this database; stop it first, or give this one a database of its own")
+    return connection
 
 
 def _alembic(engine: sa.Engine) -> AlembicConfig:

@@ -1,17 +1,21 @@
 """The one place where words get their order: rights, log, truth, and everybody in the room hears of it.
 
-Words of all cases wait in one queue; one task takes what waits, folds it into the truth, writes it in one transaction,
-and only then answers and tells the rooms. What cannot be written did not happen. A stop does not wait for the disk:
-the projector is dark before it is written down.
+Words of all cases wait in one queue; one task takes what waits, folds it into a copy of the truth, writes it in one
+transaction, and only then makes the copy the truth, answers and tells the rooms. What cannot be written did not happen,
+and nobody ever saw it. A stop does not wait for the disk: the projector is dark before it is written down.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import secrets
+import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import sqlalchemy as sa
@@ -33,18 +37,38 @@ from fringescope.wire.room import Event, Said, Standing, Warned
 INSTRUMENT = "instrument"
 _BATCH = 256  #: words written at once
 _BOOKS = 64  #: cases whose truth is kept ready
+_SAID = 1000  #: answers of each client that are kept ready; older ones are looked up in the log
+_OWED_S = 1.0  #: a stop that could not be written down is tried again so often
+_LOG = logging.getLogger("fringescope.hub")
 
 CarryOut = Callable[[Record, truth.Fold], Awaitable[None]]
 
 
 @dataclass(eq=False)
+class Heard:
+    """What a client has said in a case: the latest answers by number, and how many are no longer kept here."""
+
+    latest: dict[int, tuple[int, str]] = field(default_factory=dict)  #: number -> (event, refused)
+    highest: int = 0
+    dropped: bool = False
+
+    def keep(self, number: int, seq: int, refused: str) -> None:
+        """One answer more."""
+        self.latest[number] = (seq, refused)
+        self.highest = max(self.highest, number)
+        if len(self.latest) > _SAID:
+            del self.latest[next(iter(self.latest))]
+            self.dropped = True
+
+
+@dataclass(eq=False)
 class Book:
-    """A case that is open: its truth, the end of its chain, and what was said in it already."""
+    """A case that is open: its truth as it is written, the end of its chain, and what was said in it already."""
 
     truth: truth.Truth
     seq: int
     head: str
-    said: dict[tuple[str, str], dict[int, tuple[int, str]]]  #: (person, client) -> number -> (event, refused)
+    said: dict[tuple[str, str], Heard]  #: by person and client
 
 
 @dataclass(eq=False)
@@ -67,7 +91,8 @@ class _Waiting:
 
 @dataclass(eq=False)
 class _Batch:
-    before: dict[str, Book] = field(default_factory=dict)
+    books: dict[str, Book] = field(default_factory=dict)  #: as they will be
+    said: dict[tuple[str, str, str, int], tuple[int, str]] = field(default_factory=dict)
     records: list[Record] = field(default_factory=list)
     beside: list[Callable[[sa.Connection], None]] = field(default_factory=list)
     after: list[Callable[[sa.Connection], None]] = field(default_factory=list)
@@ -91,6 +116,7 @@ class Hub:
         self._ticks: asyncio.Task[None] | None = None
         self._numbers = 0
         self._run = secrets.token_hex(8)  #: this run of the hub, the client of its own words
+        self._owed: set[str] = set()  #: cases that are dark although their log could not say so
         self.carry_out: CarryOut = _nobody
         self.dark: Callable[[str], None] = lambda _why: None  #: darkness at once, from any thread
 
@@ -130,11 +156,15 @@ class Hub:
             why = "your account was closed, or your invitation has ended"
         if why:
             payload = {}
-        elif what.kind == "stop" and self.lit(case):
+        dark = what.kind == "stop" and not why and self.lit(case)
+        if dark:
             self.dark(f"stopped by {speaker.person}")
-        return await self._put(
+        said = await self._put(
             case, speaker.person, speaker.role.value, what.kind, payload, op.client, op.number, op.at_ns, why
         )
+        if dark and said.seq is None:
+            self._owed.add(case)
+        return said
 
     async def tell(self, case: str, word: What) -> Said:
         """A word of the instrument, for the examination of a case."""
@@ -219,7 +249,8 @@ class Hub:
             if not r.refused:
                 book.truth = truth.follow(book.truth, r, self._settings).truth
             book.seq, book.head = r.seq, r.hash
-            book.said.setdefault((r.actor, r.client), {})[r.number] = (r.seq, r.refused)
+            if r.actor != INSTRUMENT:  # it never says anything twice
+                book.said.setdefault((r.actor, r.client), Heard()).keep(r.number, r.seq, r.refused)
         return book
 
     async def _in_thread(self, work: Callable[[], Any]) -> Any:
@@ -235,42 +266,102 @@ class Hub:
             try:
                 await self._take(waiting)
             except Exception as e:  # a fault of ours must not end the hub: these words did not happen
-                for w in waiting:
-                    if not w.answer.done():
-                        w.answer.set_exception(e)
+                _LOG.exception("words were not taken")
+                self._refuse(waiting, f"{type(e).__name__}: this is a bug; report it. Nothing was changed")
             finally:
                 for _ in waiting:
                     self._queue.task_done()
 
-    async def _take(self, waiting: list[_Waiting]) -> None:
+    async def _take(self, waiting: list[_Waiting], again: bool = True) -> None:
         batch = _Batch()
         try:
             for w in waiting:
-                self._place(batch, w, await self._book(w.case))
+                if w.case not in batch.books:
+                    batch.books[w.case] = replace(await self._book(w.case))
+                self._place(batch, w, await self._earlier(batch, w))
             await self._in_thread(lambda: self._commit(batch))
-        except Exception as e:
-            for case, book in batch.before.items():
-                self._books[case] = book
-            if not isinstance(e, FringescopeError):
-                raise
-            for w in waiting:
-                w.answer.set_result(Said(client=w.client, number=w.number, seq=None, refused=str(e)))
+        except OutputError as e:
+            caught_up = await self._catch_up(batch)
+            if caught_up and again:  # the answer of the database was lost, not the words
+                await self._take(waiting, again=False)
+            else:
+                self._refuse(waiting, str(e))
             return
+        except Exception as e:
+            if len(waiting) > 1:  # one word that cannot be written takes no other down with it
+                for w in waiting:
+                    await self._take([w])
+                return
+            if not isinstance(e, (FringescopeError, sa.exc.DatabaseError)):
+                raise
+            why = f"it cannot be written: {e.orig}" if isinstance(e, sa.exc.DatabaseError) else str(e)
+            await self._catch_up(batch)
+            self._refuse(waiting, f"{why}; nothing was changed")
+            return
+        self._keep(batch)
         for w, said in batch.answers:
             if not w.answer.done():
                 w.answer.set_result(said)
         for w, record, fold in batch.folds:
             self.rooms.event(w.case, as_event(record))
-            await self._follow_up(w.case, record, fold)
+            try:
+                await self._follow_up(w.case, record, fold)
+            except Exception:  # the next ones are told all the same
+                _LOG.exception("event %d of case %s was not carried out", record.seq, w.case)
 
-    def _place(self, batch: _Batch, w: _Waiting, book: Book) -> None:
+    @staticmethod
+    def _refuse(waiting: list[_Waiting], why: str) -> None:
+        for w in waiting:
+            if not w.answer.done():
+                w.answer.set_result(Said(client=w.client, number=w.number, seq=None, refused=why))
+
+    def _keep(self, batch: _Batch) -> None:
+        """What was written is the truth from now on."""
+        self._books.update(batch.books)
+        for (case, actor, client, number), (seq, refused) in batch.said.items():
+            batch.books[case].said.setdefault((actor, client), Heard()).keep(number, seq, refused)
+
+    async def _catch_up(self, batch: _Batch) -> bool:
+        """After a failure: reads cases anew whose log goes on behind what is known here; whether there was one."""
+        found = False
+        for case in batch.books:
+            book = await self._book(case)
+            try:
+                unknown = await self._in_thread(partial(self._behind, case, book.seq))
+                if not unknown:
+                    continue
+                self._books[case] = book = await self._in_thread(partial(self._read, case))
+            except (FringescopeError, sa.exc.SQLAlchemyError):
+                continue  # it does not answer at all
+            for r in unknown:
+                self.rooms.event(case, as_event(r))
+            self.rooms.standing(case, Standing(seq=book.seq, state=truth.standing(book.truth)))
+            found = True
+        return found
+
+    def _behind(self, case: str, seq: int) -> list[Record]:
+        return list(journal.entries(self.engine, case, seq))
+
+    async def _earlier(self, batch: _Batch, w: _Waiting) -> tuple[int, str] | None:
+        """The answer that a word was given before, if it was said before."""
+        if (found := batch.said.get((w.case, w.actor, w.client, w.number))) is not None:
+            return found
+        heard = batch.books[w.case].said.get((w.actor, w.client))
+        if heard is None:
+            return None
+        if heard.dropped and w.number <= heard.highest and w.number not in heard.latest:
+            asked = (self.engine, w.case, w.actor, w.client, w.number)
+            kept: tuple[int, str] | None = await self._in_thread(lambda: journal.answer(*asked))
+            return kept
+        return heard.latest.get(w.number)
+
+    def _place(self, batch: _Batch, w: _Waiting, earlier: tuple[int, str] | None) -> None:
         """Gives a word its place, unless it has one."""
-        earlier = book.said.get((w.actor, w.client), {}).get(w.number)
         if earlier is not None:
             said = Said(client=w.client, number=w.number, seq=earlier[0], refused=earlier[1])
             batch.answers.append((w, said))
             return
-        batch.before.setdefault(w.case, replace(book, said={k: dict(v) for k, v in book.said.items()}))
+        book = batch.books[w.case]
         bare = Record(
             w.case, book.seq + 1, self.clock.now_ns(), w.said_ns, w.actor, w.role, w.client, w.number, w.kind,
             w.refused, secrets.token_hex(16), w.payload, "", "",
@@ -280,7 +371,8 @@ class Hub:
             fold = truth.follow(book.truth, bare, self._settings)
         record = link(replace(bare, payload=fold.payload, refused=fold.refused), book.head)
         book.truth, book.seq, book.head = fold.truth, record.seq, record.hash
-        book.said.setdefault((w.actor, w.client), {})[w.number] = (record.seq, record.refused)
+        if w.client != self._run:
+            batch.said[w.case, w.actor, w.client, w.number] = (record.seq, record.refused)
         batch.records.append(record)
         if w.beside is not None and not record.refused:
             batch.beside.append(w.beside)
@@ -291,15 +383,12 @@ class Hub:
         batch.answers.append((w, said))
 
     def _commit(self, batch: _Batch) -> None:
-        try:
-            with db.writing(self.engine) as c:
-                for beside in batch.beside:
-                    beside(c)
-                journal.append(c, batch.records)
-                for after in batch.after:
-                    after(c)
-        except sa.exc.DatabaseError as e:
-            raise OutputError(f"the log cannot be written: {e.orig}; nothing was changed") from e
+        with db.writing(self.engine) as c:
+            for beside in batch.beside:
+                beside(c)
+            journal.append(c, batch.records)
+            for after in batch.after:
+                after(c)
 
     async def _follow_up(self, case: str, record: Record, fold: truth.Fold) -> None:
         if fold.refused:
@@ -316,12 +405,20 @@ class Hub:
 
     async def _tick(self) -> None:
         """What the clock makes true."""
+        owed_s = 0.0
         while True:
             await asyncio.sleep(0.05)
-            for case, book in list(self._books.items()):
-                if any(v.phase in (Phase.ARMED, Phase.PROJECTING) for v in book.truth.exam.versions):
-                    for word in examination.due(book.truth.exam, self.clock.now_ns(), self._settings):
-                        await self.tell(case, word)
+            with contextlib.suppress(FringescopeError):
+                for case, book in list(self._books.items()):
+                    if any(v.phase in (Phase.ARMED, Phase.PROJECTING) for v in book.truth.exam.versions):
+                        for word in examination.due(book.truth.exam, self.clock.now_ns(), self._settings):
+                            await self.tell(case, word)
+            if self._owed and time.monotonic() - owed_s > _OWED_S:
+                owed_s = time.monotonic()
+                for case in list(self._owed):
+                    said = await self.tell(case, GuardLost("stopped; it could not be written down at once"))
+                    if said.seq is not None:
+                        self._owed.discard(case)
 
 
 _DRAWN = ("put", "remove", "layer", "comment", "withdraw", "undo", "opened", "changed", "invited", "joined")

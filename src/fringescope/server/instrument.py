@@ -83,7 +83,7 @@ class Instrument:
         """Opens the devices. Raises DeviceError."""
         uri = self._config.instrument
         if uri is None:
-            raise DeviceError("this hub has no instrument; start it with --instrument URI")
+            raise DeviceError("this hub has no instrument; start it with --device URI")
         if self._open and self._devices.alive:
             return
         try:

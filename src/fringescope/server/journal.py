@@ -57,6 +57,17 @@ def entries(engine: sa.Engine, case: str, since: int = 0) -> Iterator[Record]:
         since = page[-1].seq
 
 
+def answer(engine: sa.Engine, case: str, actor: str, client: str, number: int) -> tuple[int, str] | None:
+    """What became of the `number`-th op of a client: its entry, and why it was refused."""
+    e = db.events
+    asked = sa.select(e.c.seq, e.c.refused).where(
+        e.c.case_id == case, e.c.actor == actor, e.c.client == client, e.c.number == number
+    )
+    with db.reading(engine) as c:
+        r = c.execute(asked).first()
+    return None if r is None else (int(r.seq), str(r.refused))
+
+
 def last_ns(engine: sa.Engine) -> int:
     """When the latest entry was made; 0 without any."""
     with db.reading(engine) as c:

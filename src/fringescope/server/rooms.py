@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 
 from fringescope.server.rights import Speaker
 from fringescope.wire import PersonRole
@@ -24,11 +25,13 @@ OVER = (1012, "the hub stops; come back")
 class Listener:
     """One connection to a room: a queue with an end."""
 
-    def __init__(self, speaker: Speaker, most: int, session: str = "") -> None:
+    def __init__(self, speaker: Speaker, most: int, most_letters: int, session: str = "") -> None:
         self.speaker, self.session = speaker, session
         self.active = False  #: whether the person said something lately
         self.ended: tuple[int, str] | None = None
-        self._most = most
+        self.on_end: Callable[[], None] = lambda: None
+        self._most, self._most_letters = most, most_letters
+        self._letters = 0  #: of the lines that wait
         self._lines: deque[str] = deque()
         self._live: dict[tuple[str, str], str] = {}  #: the latest pointer, view or ink of each person
         self._wake = asyncio.Event()
@@ -36,8 +39,8 @@ class Listener:
     def send(self, line: str) -> None:
         """A message that must arrive."""
         if self.ended is None:
-            self._lines.append(line)
-            if len(self._lines) > self._most:
+            self._wait(line)
+            if len(self._lines) > self._most or self._letters > self._most_letters:
                 self.end(TOO_SLOW)
             self._wake.set()
 
@@ -45,18 +48,22 @@ class Listener:
         """A message of which only the latest counts. Ink is a line of pieces: it waits in order while there is room."""
         if self.ended is not None:
             return
-        if key[1] == "ink" and len(self._lines) < self._most // 4:
-            self._lines.append(line)
+        if key[1] == "ink" and len(self._lines) < self._most // 4 and self._letters < self._most_letters // 4:
+            self._wait(line)
         else:
             self._live[key] = line
         self._wake.set()
+
+    def _wait(self, line: str) -> None:
+        self._lines.append(line)
+        self._letters += len(line)
 
     def end(self, why: tuple[int, str]) -> None:
         """No more messages: code and reason for the browser."""
         if self.ended is None:
             self.ended = why
-            self._lines.clear()
-            self._live.clear()
+            self._clear()
+            self.on_end()
         self._wake.set()
 
     def end_soon(self, why: tuple[int, str]) -> None:
@@ -65,29 +72,33 @@ class Listener:
             self.ended = why
         self._wake.set()
 
+    def _clear(self) -> None:
+        self._lines.clear()
+        self._live.clear()
+        self._letters = 0
+
     async def next(self) -> list[str]:
         """What waits, once something does; nothing at all when it has ended."""
         while not (self._lines or self._live or self.ended):
             self._wake.clear()
             await self._wake.wait()
         out = [*self._lines, *self._live.values()]
-        self._lines.clear()
-        self._live.clear()
+        self._clear()
         return out
 
 
 class Rooms:
     """The listeners of all cases. Lives on one event loop."""
 
-    def __init__(self, most: int = 4000) -> None:
-        self._most = most
+    def __init__(self, most: int = 4000, most_letters: int = 16_000_000) -> None:
+        self._most, self._most_letters = most, most_letters
         self._rooms: dict[str, set[Listener]] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def join(self, case: str, speaker: Speaker, session: str = "") -> Listener:
         """A new listener; the others hear of it."""
         self._loop = asyncio.get_running_loop()
-        made = Listener(speaker, self._most, session)
+        made = Listener(speaker, self._most, self._most_letters, session)
         self._rooms.setdefault(case, set()).add(made)
         self._presence(case)
         return made
@@ -121,8 +132,8 @@ class Rooms:
             self._loop.call_soon_threadsafe(self._expel, person, case, session)
 
     def _expel(self, person: str, case: str | None, session: str | None) -> None:
-        for name, room in self._rooms.items():
-            for listener in room:
+        for name, room in list(self._rooms.items()):
+            for listener in list(room):
                 wanted = case in (None, name) and session in (None, listener.session)
                 if listener.speaker.person == person and wanted:
                     listener.end(EXPELLED)

@@ -22,6 +22,7 @@ from fringescope.server.config import LOOPBACK, Config
 from fringescope.server.site import Site
 from fringescope.wire import PersonRole
 
+_DEAF_MS = 60_000  #: a connection through which nothing can be sent for so long is given up
 DAYS = 397  #: how long a self-made certificate is good
 
 
@@ -99,8 +100,11 @@ class Server:
 
 def _bind(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    made = socket.socket(family, socket.SOCK_STREAM)
+    # asyncio sends small messages at once only where a socket says that it is TCP
+    made = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # who takes nothing for so long is cut off, closed or not
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _DEAF_MS)
     try:
         made.bind((host, port))
     except (OSError, OverflowError) as e:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import argon2
+import sqlalchemy as sa
 
 from fringescope.errors import OutputError
 from fringescope.server import database as db
@@ -55,9 +56,12 @@ class Site:
     checkpoints: Checkpoints
     leaving: Leaving
     lock: int
+    database_lock: sa.Connection | None
 
     def close(self) -> None:
         """Lets go of the data folder and the database."""
+        if self.database_lock is not None:
+            self.database_lock.close()
         self.engine.dispose()
         os.close(self.lock)
 
@@ -87,8 +91,12 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
     lock = hold(config)
     with contextlib.ExitStack() as undo:
         undo.callback(os.close, lock)
+        shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         engine = db.open_engine(config.url)
         undo.callback(engine.dispose)
+        database_lock = db.hold(engine)
+        if database_lock is not None:
+            undo.callback(database_lock.close)
         db.migrate(engine)
         shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         clock = Clock(journal.last_ns(engine))
@@ -96,7 +104,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         finish_erasures(config.data, engine, blobs)
         limits = config.limits
         accounts = Accounts(engine, clock, limits, hasher)
-        rooms = Rooms(limits.waiting)
+        rooms = Rooms(limits.waiting, limits.waiting_letters)
         hub = Hub(engine, clock, accounts, rooms, config.settings.examination)
         jobs = Jobs(engine, clock)
         checkpoints = Checkpoints(engine, clock, config.data)
@@ -110,7 +118,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
             Throttle(limits.ops_per_s, limits.ops_burst), Passkeys(engine, clock, accounts),
             None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), checkpoints,
-            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock,
+            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock, database_lock,
         )  # fmt: skip
         undo.pop_all()
     return site

@@ -33,6 +33,7 @@ from fringescope.wire.record import Record, canonical
 
 ERASED = "the case was erased; open another"
 MOST = 5000  #: strokes, layers or comments of a case
+UNDOABLE = 500  #: the latest ops of a case that can be taken back; a case that goes on for days stays as small
 
 Item = tuple[str, str]  #: ("stroke" | "layer" | "comment", identifier)
 
@@ -46,6 +47,7 @@ class Done:
     before: Mapping[str, Any] | None
     after: Mapping[str, Any] | None
     undone: bool = False
+    backward: bool = False  #: it took something back: what is undone next lies before it
 
 
 @dataclass(frozen=True)
@@ -168,8 +170,14 @@ def _item(
     _place(items, item, value)
     if len(items) > MOST:
         raise _NoError(f"more than {MOST} strokes, layers and comments in one case; remove some first")
-    done = {**truth.done, r.seq: Done(r.actor, item, before, value)}
+    done = _latest({**truth.done, r.seq: Done(r.actor, item, before, value)})
     return Fold(replace(truth, exam=exam, items=items, done=done), payload, effects)
+
+
+def _latest(done: dict[int, Done]) -> dict[int, Done]:
+    while len(done) > UNDOABLE:
+        del done[next(iter(done))]
+    return done
 
 
 def _place(items: dict[Item, Mapping[str, Any]], item: Item, value: Mapping[str, Any] | None) -> None:
@@ -192,12 +200,14 @@ def _tell_exam(
 def _undo(truth: Truth, r: Record, payload: dict[str, Any], s: ExaminationSettings) -> Fold:
     of = payload.get("of")
     if of is None:
-        of = max((n for n, d in truth.done.items() if d.actor == r.actor and not d.undone), default=None)
+        of = max(
+            (n for n, d in truth.done.items() if d.actor == r.actor and not (d.undone or d.backward)), default=None
+        )
         if of is None:
             raise _NoError("nothing of yours is left to undo")
     done = truth.done.get(of)
     if done is None:
-        raise _NoError(f"event {of} is none that can be undone; strokes, layers and comments can")
+        raise _NoError(f"event {of} cannot be undone; strokes, layers and comments of the last {UNDOABLE} ops can")
     if done.actor != r.actor:
         raise _NoError(f"event {of} is {done.actor}'s; only its author undoes it")
     if done.undone:
@@ -207,7 +217,8 @@ def _undo(truth: Truth, r: Record, payload: dict[str, Any], s: ExaminationSettin
     exam, effects = _tell_exam(truth.exam, r, done.item, done.before, s)
     items = dict(truth.items)
     _place(items, done.item, done.before)
-    marked = {**truth.done, of: replace(done, undone=True), r.seq: Done(r.actor, done.item, done.after, done.before)}
+    back = Done(r.actor, done.item, done.after, done.before, backward=not done.backward)
+    marked = _latest({**truth.done, of: replace(done, undone=True), r.seq: back})
     was = {"kind": done.item[0], "id": done.item[1], "value": None if done.before is None else dict(done.before)}
     return Fold(replace(truth, exam=exam, items=items, done=marked), {**payload, "of": of, "does": was}, effects)
 

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import contextlib
 import json
+import logging
 import time
 from typing import Any
 
@@ -17,18 +18,19 @@ from fringescope.errors import DeviceError, FringescopeError
 from fringescope.server import database as db
 from fringescope.server import journal, truth
 from fringescope.server.accounts import SignInError
-from fringescope.server.asking import Asking, asking_of, may_see, size_of, still
+from fringescope.server.asking import Asking, asking_of, may_see, one_line, size_of, still
 from fringescope.server.hub import as_event
 from fringescope.server.rights import refusal
 from fringescope.server.rooms import EXPELLED, FLOOD, Listener
 from fringescope.server.security import origin_fits
 from fringescope.server.throttle import Bucket
-from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Relayed, Say, Standing, Welcome
+from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Relayed, Said, Say, Standing, Welcome
 
 router = APIRouter()
 _MESSAGE: TypeAdapter[Any] = TypeAdapter(FromClient)
 _PAGE = 500
-_LAST_WORD_S = 2.0  #: how long a browser has to hear why its connection is closed
+_LOG = logging.getLogger("fringescope.room")
+_PARTING_S = 30.0  #: so long a browser may take until it reads why it was let go
 
 
 async def _enter(socket: WebSocket, case: str, what: str) -> Asking | None:
@@ -71,16 +73,29 @@ async def room(socket: WebSocket, case: str, since: int = 0) -> None:
     await socket.accept()
     listener = site.rooms.join(case, asking.speaker, asking.session.digest)  # from here on nothing is missed
     if not await run_in_threadpool(still, asking, case):  # a right that was taken away while they came in
-        listener.end(EXPELLED)
+        site.rooms.leave(case, listener)
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+            await socket.close(*EXPELLED)
+        return
     sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since)))
+    receiver = asyncio.create_task(_receive(socket, asking, case, listener))
+    listener.on_end = lambda: _end(sender)  # it may hang on a browser that does not read
     try:
-        await _receive(socket, asking, case, listener)
+        await asyncio.wait({sender, receiver}, return_when=asyncio.FIRST_COMPLETED)
     finally:
         site.rooms.leave(case, listener)
-        if listener.ended is None:
-            sender.cancel()
-        with contextlib.suppress(asyncio.CancelledError, Exception):
-            await asyncio.wait_for(sender, _LAST_WORD_S)
+        for task in (sender, receiver):
+            task.cancel()
+        for fault in await asyncio.gather(sender, receiver, return_exceptions=True):
+            if isinstance(fault, Exception) and not isinstance(fault, (WebSocketDisconnect, RuntimeError)):
+                _LOG.error("a room was closed by a fault", exc_info=fault)
+    if listener.ended is not None:
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
+            await asyncio.wait_for(socket.close(*listener.ended), _PARTING_S)
+
+
+def _end(task: asyncio.Task[None]) -> None:
+    task.cancel()
 
 
 async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int) -> None:
@@ -108,7 +123,6 @@ async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener
                 continue  # was sent already
             await socket.send_text(line)
         if listener.ended is not None:
-            await socket.close(*listener.ended)
             return
 
 
@@ -122,7 +136,7 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
-            text = message.get("text") or ""
+            text = message.get("text")
             if listener.ended is not None:  # while this message was on its way
                 return
             if not every.take():
@@ -131,6 +145,9 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             if not site.accounts.allowed(asking.speaker.person):
                 listener.end(EXPELLED)
                 return
+            if text is None:
+                listener.send(_refused("a message of bytes; needed one JSON object as text"))
+                continue
             if len(text) > limits.message_bytes:
                 listener.send(_refused(f"a message of {len(text)} letters; at most {limits.message_bytes} are taken"))
                 continue
@@ -159,20 +176,23 @@ async def _say(
     asking: Asking, case: str, listener: Listener, said: Say, waiting: set[asyncio.Task[None]], size: int
 ) -> None:
     """An op on its way to the log; a stop of something that is armed or lit is never too often."""
-    what = said.op.what.kind
+    op, what = said.op, said.op.what.kind
+
+    def refuse(why: str) -> None:
+        listener.send(Said(client=op.client, number=op.number, seq=None, refused=why).model_dump_json())
+
     if not (what == "stop" and asking.site.hub.can_stop(case)) and asking.site.ops.take(asking.speaker.person, size):
-        listener.send(_refused(f"op {said.op.number}: too many ops; wait a moment and say it again"))
+        refuse("too many ops; wait a moment and say it again")
         return
     if what == "carry_over":
-        listener.send(_refused("carry_over: use the route of that name, which looks the job up"))
+        refuse("carry_over: use the route of that name, which looks the job up")
         return
 
     async def answer() -> None:
         try:
-            line = (await asking.site.hub.say(case, await _fresh(asking, what), said.op)).model_dump_json()
+            listener.send((await asking.site.hub.say(case, await _fresh(asking, what), op)).model_dump_json())
         except FringescopeError as e:
-            line = _refused(str(e))
-        listener.send(line)
+            refuse(str(e))
 
     # the queue of the hub keeps the order: the task is in it before the next message is read
     task = asyncio.create_task(answer())
@@ -204,7 +224,7 @@ def _refused(why: str) -> str:
 def _why(e: ValidationError) -> str:
     first = e.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(x) for x in first["loc"])
-    return f"a message that nobody understands: {where}: {first['msg']}"[:300]
+    return one_line(f"a message that nobody understands: {where + ': ' if where else ''}{first['msg']}")
 
 
 # -------------------------------------------------------------------------------------------------------------- video

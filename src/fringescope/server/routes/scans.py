@@ -9,7 +9,7 @@ from fastapi import APIRouter, HTTPException, Path, Query
 from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 
-from fringescope.errors import FringescopeError, UsageError
+from fringescope.errors import UsageError
 from fringescope.server import cases as kept
 from fringescope.server.asking import CaseId, Who, may_see, problems
 from fringescope.wire import Job, Op, ScanFile, ScanInfo
@@ -91,8 +91,8 @@ def files(case: CaseId, who: Who) -> dict[str, list[ScanFile]]:
     tags=["scans"],
     response_class=FileResponse,
     responses={
-        200: {"content": {"application/octet-stream": {}}, "description": "The file."},
-        206: {"content": {"application/octet-stream": {}}, "description": "A range of it."},
+        200: {"content": {"*/*": {}}, "description": "The file."},
+        206: {"content": {"*/*": {}}, "description": "A range of it."},
         **problems(401, 403, 404, 416),
     },
 )
@@ -189,7 +189,7 @@ async def calibrate(who: Who) -> Job:
         raise HTTPException(409, str(e)) from None
 
 
-@router.post("/instrument/simulate", tags=["instrument"], responses=problems(400, 401, 403, 503))
+@router.post("/instrument/simulate", tags=["instrument"], responses=problems(401, 409))
 async def simulate(what: dict[str, str], who: Who) -> Ended:
     """For the simulated instrument alone: something happens to the specimen, as {"move": "0.3,0,0"}."""
     who.must("scan.take")
@@ -197,6 +197,4 @@ async def simulate(what: dict[str, str], who: Who) -> Ended:
         await who.site.instrument.befall(what)
     except UsageError as e:
         raise HTTPException(400, str(e)) from None
-    except FringescopeError as e:
-        raise HTTPException(503, str(e)) from None
     return Ended()
