@@ -9,7 +9,10 @@ import pytest
 
 pytest.importorskip("fastapi", reason="needs fringescope[server]")
 
+from sqlalchemy import Engine
+
 from fringescope.client import Client
+from fringescope.server import audit
 from fringescope.server.config import Config
 from fringescope.server.running import Server
 from fringescope.wire import PersonRole
@@ -81,3 +84,9 @@ def scan_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rig = at / "capture" / "truth" / "rig.json"
     assert cli.run(["reconstruct", str(at / "capture"), "--rig", str(rig), "--out", str(at / "scan")]) == 0
     return at / "scan"
+
+
+def checked(engine: Engine) -> tuple[int, int, list[str]]:
+    """Cases, events and faults of a hub's log, by itself: no checkpoints."""
+    found = audit.verify(engine, Path("nowhere"))
+    return found.cases, found.events, list(found.faults)

@@ -60,7 +60,7 @@ async def keep_one(server: Server) -> str:
         for k in range(FILES):
             (folder / f"part{k}.npy").write_bytes(secrets.token_bytes(150_000))
         scan = "sha256:" + hashlib.sha256((folder / "part0.npy").read_bytes()).hexdigest()
-        await server.site.instrument.keep(SCANS, "", folder, {"hash": scan, "rig": "rig"})
+        await server.site.lab.keep(SCANS, "", folder, {"hash": scan, "rig": "rig"})
     return scan
 
 

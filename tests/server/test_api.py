@@ -17,11 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fringescope.client import Client
-from fringescope.server import journal
 from fringescope.server.accounts import SignInError
 from fringescope.server.config import Config, Limits
 from fringescope.server.running import Server
-from tests.server.conftest import PASSWORD, database, populate
+from tests.server.conftest import PASSWORD, checked, database, populate
 from tests.server.test_hub import SCAN, invite, scanned, stroke
 
 schemathesis = pytest.importorskip("schemathesis", reason="needs fringescope[dev]")
@@ -118,6 +117,14 @@ def world_session(world: World, client: Client) -> None:
     world.server.site.accounts.session(client.http.cookies.get("fringescope", ""))
 
 
+schemathesis.openapi.media_type("application/zip", st.binary(max_size=2000))
+
+
+@schemathesis.serializer("application/zip")
+def as_it_is(_ctx: Any, value: Any) -> bytes:
+    return value if isinstance(value, bytes) else str(value).encode()
+
+
 def everything(world: World, examples: int) -> None:
     """Each operation, by everybody."""
     from schemathesis.checks import CHECKS
@@ -143,7 +150,7 @@ def one(
 
     def ask(case: Any, real: int) -> None:
         for key in case.path_parameters or {}:
-            if real and key in world.real:
+            if real and key in world.real and not operation.path.endswith("/erase"):  # the others need it yet
                 case.path_parameters[key] = world.real[key][real == 9 and -1]
         for role in ROLES:
             if (role, operation.path) == ("guest", "/api/logout"):
@@ -169,7 +176,9 @@ def one(
 
 
 def _can_be_bad(operation: Any) -> bool:
-    """Where nothing is asked for nothing can be wrong."""
+    """Where nothing is asked for, or any bytes are taken, nothing can be wrong."""
+    if operation.path.endswith("/import"):
+        return False
     return bool(operation.body) or any(len(list(group)) for group in (operation.path_parameters, operation.query))
 
 
@@ -179,10 +188,12 @@ def judged(world: World) -> None:
     asked = {name for (name, _) in world.answers}
     never = {  # without an instrument, a stale version, the right password or code
         "POST /api/password", "POST /api/confirm", "POST /api/login", "POST /api/invitations/accept",
-        "POST /api/cases/{case}/carry_over", "POST /api/instrument/simulate",
+        "POST /api/cases/{case}/carry_over", "POST /api/instrument/simulate", "POST /api/cases/import",
+        "POST /api/cases/{case}/erase", "POST /api/passkeys", "POST /api/passkeys/login", "POST /api/passkeys/confirm",
+        "DELETE /api/passkeys/{key}", "GET /api/provider/begin", "GET /api/provider/callback",
     }  # fmt: skip
     assert asked - done - never == set()
-    assert journal.check(world.server.site.engine)[2] == []
+    assert checked(world.server.site.engine)[2] == []
 
 
 @pytest.mark.parametrize("world", ["sqlite"], indirect=True)

@@ -17,11 +17,10 @@ from alembic.migration import MigrationContext
 from fringescope.client import Client
 from fringescope.errors import FormatError, OutputError
 from fringescope.server import database as db
-from fringescope.server import journal
 from fringescope.server.config import Config
 from fringescope.server.running import Server
 from fringescope.server.site import open_site
-from tests.server.conftest import PASSWORD, SignIn, both, database
+from tests.server.conftest import PASSWORD, SignIn, both, checked, database
 from tests.server.postgres import Cluster
 from tests.server.test_hub import SCAN, scanned, stroke
 
@@ -87,7 +86,7 @@ def test_the_database_itself_refuses_to_alter_the_log(hub: Server, sign_in: Sign
     with pytest.raises(sa.exc.DatabaseError), hub.site.engine.begin() as c:
         c.exec_driver_sql(line)
     assert case.events() == before
-    assert journal.check(hub.site.engine)[2] == []
+    assert checked(hub.site.engine)[2] == []
 
 
 @both
@@ -111,7 +110,7 @@ def test_many_at_once_get_one_order(hub: Server, sign_in: SignIn) -> None:
     for n in range(3):
         given = sorted(s for k in (n, n + 3) for s in answers[k] if s is not None)
         assert given == list(range(4, 24))
-    cases_, count, faults = journal.check(hub.site.engine)
+    cases_, count, faults = checked(hub.site.engine)
     assert (cases_, count, faults) == (3, 69, [])
 
 
@@ -150,6 +149,6 @@ def test_the_database_goes_away_and_comes_back(tmp_path: Path) -> None:
                     cluster.start()
                     room.draw(stroke("b"))
                     assert [e.seq for e in room.events] == [1, 2, 3, 4, 5]
-                assert journal.check(hub.site.engine)[1:] == (5, [])
+                assert checked(hub.site.engine)[1:] == (5, [])
     finally:
         cluster.close()

@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from fringescope import examination
 from fringescope.client import Client, HubCase, HubError, Room
 from fringescope.errors import OutputError
-from fringescope.server import clock, journal
+from fringescope.server import clock
 from fringescope.server.blobs import Blobs
 from fringescope.server.clock import Clock
 from fringescope.server.config import Config, Limits
@@ -33,7 +33,7 @@ from fringescope.server.rooms import TOO_SLOW, Listener
 from fringescope.server.running import Server
 from fringescope.server.site import open_site
 from fringescope.types.examination import Checked, Guarded, Previewed, Standing, Watched
-from tests.server.conftest import PASSWORD, SignIn, populate
+from tests.server.conftest import PASSWORD, SignIn, checked, populate
 from tests.server.test_hub import SCAN, invite, scanned, stroke, told
 
 # --------------------------------------------------------------------------------------------------------- a full disk
@@ -86,7 +86,7 @@ def test_a_full_disk(hub: Server, sign_in: SignIn) -> None:
         other.until(lambda: other.seq == room.seq)
         assert [e.hash for e in other.events] == [e.hash for e in room.events] == [e.hash for e in case.events()]
         assert set(case.state().strokes) == {*before.strokes, "t"}
-    assert journal.check(hub.site.engine)[2] == []
+    assert checked(hub.site.engine)[2] == []
 
 
 def lit(hub: Server, case: HubCase, room: Room) -> int:
@@ -185,9 +185,9 @@ def test_on_a_disk_that_is_really_full(tmp_path: Path) -> None:
                     ballast.unlink()
                     room.draw(stroke("t"))
                     assert [e.seq for e in room.events] == list(range(1, before + 2))
-                assert journal.check(hub.site.engine)[2] == []
+                assert checked(hub.site.engine)[2] == []
         site = open_site(Config(folder / "hub"))
-        assert journal.check(site.engine)[1:] == (before + 1, [])
+        assert checked(site.engine)[1:] == (before + 1, [])
         site.close()
     finally:
         subprocess.run(["umount", str(folder)], check=True)

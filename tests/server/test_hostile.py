@@ -142,7 +142,7 @@ def test_a_flood_of_stops_fills_no_log_and_a_stop_that_matters_is_never_too_ofte
     with world_at(tmp_path, limits=few) as world, room_of(world.client("observer"), world.case.id) as room:
         before = len(world.case.events())
         answers = [say(room, {"kind": "stop"}) for _ in range(30)]
-        assert sum("too many ops" in x.get("why", "") for x in answers) == 25
+        assert sum("too many ops" in x.get("refused", "") for x in answers) == 25
         assert len(world.case.events()) == before + 5
         path, body = f"/api/cases/{world.case.id}/ops", [op({"kind": "stop"})]
         assert asked(world.client("observer"), "POST", path, body).status_code == 429

@@ -93,7 +93,7 @@ def test_undo_takes_back_and_undo_of_undo_does_it_again(hub: Server, sign_in: Si
         room.comment("look here", stroke="s")
         room.undo()
         assert not case.state().comments
-    assert len(case.events()) == 3 + 9  # nothing was ever taken out of the log, and what was refused is in it
+    assert len(case.events()) == 3 + 12  # nothing was ever taken out of the log, and what was refused is in it
 
 
 def test_only_its_author_changes_a_stroke(hub: Server, sign_in: SignIn) -> None:

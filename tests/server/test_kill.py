@@ -19,10 +19,9 @@ import pytest
 
 from fringescope.client import Client, HubError, Room
 from fringescope.server import database as db
-from fringescope.server import journal
 from fringescope.server.config import Config
 from fringescope.wire.room import Event
-from tests.server.conftest import PASSWORD
+from tests.server.conftest import PASSWORD, checked
 from tests.server.hub_process import FILES, SCANS, STROKES
 
 
@@ -189,7 +188,7 @@ def killed(root: Path, folder: Path, times: int, victims: list[Victim], url: str
     victim.kill()
     whole_files(folder / "files")
     engine = db.open_engine(Config(folder, database=url).url)
-    cases, events, faults = journal.check(engine)
+    cases, events, faults = checked(engine)
     engine.dispose()
     assert (cases, faults) == (2, [])
     assert victim.scans

@@ -16,11 +16,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from fringescope.client import Client, HubCase
-from fringescope.server import journal
 from fringescope.server.config import Config, Limits
 from fringescope.server.running import Server
 from fringescope.wire.room import FromServer
-from tests.server.conftest import PASSWORD, SignIn, both, populate
+from tests.server.conftest import PASSWORD, SignIn, both, checked, populate
 from tests.server.test_hub import RIG, SCAN, scanned, stroke
 
 FROM_SERVER: TypeAdapter[Any] = TypeAdapter(FromServer)
@@ -187,7 +186,7 @@ def test_numbers_that_go_back_and_come_twice(quick: Server) -> None:
         {"kind": "undo", "of": 2**70},
         {"kind": "sign", "version": -(10**30), "content": "x", "meaning": "approved"},
         {"kind": "preview", "version": 10**200},
-        {"kind": "acknowledge", "suspect_ns": 10**200},
+        {"kind": "acknowledge", "suspect": "9" * 19},
         {"kind": "start", "version": 10**30, "pattern": "%s %(x)s {} \\"},
         {"kind": "submit", "strokes": [["__proto__", "constructor"]] * 1000, "scan": SCAN, "rig": RIG},
         {"kind": "submit", "strokes": [["s", "x"]], "scan": "../../etc/passwd", "rig": RIG},
@@ -213,7 +212,7 @@ def test_strange_words_of_the_right_form(hub: Server, sign_in: SignIn, what: dic
             if key in what and said["refused"] == "":
                 assert log[0].payload is not None
                 assert log[0].payload[key] == what[key]
-    assert journal.check(hub.site.engine)[2] == []
+    assert checked(hub.site.engine)[2] == []
     assert case.state().seq == log[-1].seq
 
 
@@ -230,7 +229,7 @@ GOOD: list[dict[str, Any]] = [
     {"kind": "submit", "strokes": [["s", "x"]], "scan": SCAN, "rig": RIG}, {"kind": "withdraw", "comment": "c1"},
     {"kind": "sign", "version": 1, "content": "x", "meaning": "approved"}, {"kind": "preview", "version": 1},
     {"kind": "arm", "version": 1, "content": "x", "pattern": "y"}, {"kind": "start", "version": 1, "pattern": "y"},
-    {"kind": "acknowledge", "suspect_ns": 1}, {"kind": "carry_over", "version": 1, "scan": SCAN, "job": "j"},
+    {"kind": "acknowledge", "suspect": "1"}, {"kind": "carry_over", "version": 1, "scan": SCAN, "job": "j"},
 ]  # fmt: skip
 
 
@@ -298,7 +297,7 @@ def test_many_messages_at_random(room: tuple[Server, HubCase, ClientConnection],
 
 def test_after_all_that_the_log_is_whole(room: tuple[Server, HubCase, ClientConnection]) -> None:
     server, case, _ = room
-    assert journal.check(server.site.engine)[2] == []
+    assert checked(server.site.engine)[2] == []
     truth = case.state()
     server.site.hub._books.clear()  # folded anew from the log it is the same
     assert case.state() == truth

@@ -99,7 +99,7 @@ ROUTES: dict[str, Row] = {
     "POST /api/instrument/stop": Row(ALL, 200),
     "POST /api/instrument/poses": Row("operator", 202, {}),
     "POST /api/instrument/calibrate": Row("operator", 202),
-    "POST /api/instrument/simulate": Row("operator", 503, {"move": "1,0,0"}),
+    "POST /api/instrument/simulate": Row("operator", 409, {"move": "1,0,0"}),
     "GET /api/audit": Row("admin", 200),
     "GET /api/cases/{case}/bundle": Row(DRAW, 200),
     "POST /api/cases/import": Row("operator", 400, {}),

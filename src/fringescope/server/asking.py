@@ -46,7 +46,8 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     words = {
         400: "the request makes no sense as it stands", 401: "nobody is signed in", 403: "not for this role",
         404: "there is none", 409: "not now", 410: "it was erased", 413: "too long", 416: "no such range",
-        422: "the request is not what is described here", 429: "too often", 507: "the disk is full",
+        422: "the request is not what is described here", 429: "too often", 503: "who should answer does not",
+        507: "the disk is full",
     }  # fmt: skip
     more = (410,) if 404 in codes else ()  # of what was there, but was erased
     often = {400, 403, 413, 422, 429, 507}
