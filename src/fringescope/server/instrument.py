@@ -23,6 +23,7 @@ from fringescope.server.blobs import Blobs
 from fringescope.server.config import Config
 from fringescope.server.hub import INSTRUMENT, Hub
 from fringescope.server.processes.parent import Child
+from fringescope.server.rights import Speaker
 from fringescope.server.shelf import Shelf
 from fringescope.server.truth import Fold, Truth
 from fringescope.settings import to_dict
@@ -149,12 +150,12 @@ class Instrument:
         if self._devices.alive:
             self._begin(self._darken())
 
-    async def stop_all(self, why: str) -> None:
-        """Dark, and every case that had something lit hears of it."""
+    async def stop_all(self, speaker: Speaker) -> None:
+        """Dark, and the case that had something armed or lit hears who stopped it."""
         case = self._shown[0] if self._shown is not None else self._case
-        self.dark(why)
-        if case is not None:
-            await self._hub.tell(case, GuardLost(" ".join(why.split())[:190]))
+        self.dark(f"stopped by {speaker.person}")
+        if case is not None and self._hub.can_stop(case):
+            await self._hub.note(case, speaker.person, speaker.role.value, "stop", {"version": None, "why": ""})
 
     async def _darken(self) -> None:
         asked = asyncio.ensure_future(self._devices.call("dark"))

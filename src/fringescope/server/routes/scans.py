@@ -164,7 +164,7 @@ async def instrument(who: Who) -> InstrumentState:
 async def stop(who: Who) -> Ended:
     """Dark, whatever is projected: for everybody, at any time."""
     who.must("instrument.stop")
-    await who.site.instrument.stop_all(f"stopped by {who.speaker.person}")
+    await who.site.instrument.stop_all(who.speaker)
     return Ended()
 
 
