@@ -12,6 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from fringescope.errors import UsageError
 from fringescope.server import cases as kept
 from fringescope.server.asking import CaseId, Who, may_see, problems
+from fringescope.server.jobs import Work
 from fringescope.wire import Job, Op, ScanFile, ScanInfo
 from fringescope.wire.documents import AskedCarry, AskedCompare, Ended, InstrumentState, NewPose, NewScan
 from fringescope.wire.room import Said
@@ -33,9 +34,13 @@ def scans(case: CaseId, who: Who) -> list[ScanInfo]:
 async def scan(case: CaseId, asked: NewScan, who: Who) -> Job:
     """Takes a scan, as a job."""
     await run_in_threadpool(who.case, case, "scan.take")
-    lab = who.site.lab
+    return _begin(who, "scan", case, lambda tell: who.site.lab.scan(case, asked.label, tell))
+
+
+def _begin(who: Who, kind: str, case: str | None, work: Work) -> Job:
+    """A job, or 409 where too many wait."""
     try:
-        return who.site.jobs.begin("scan", case, who.speaker.person, lambda tell: lab.scan(case, asked.label, tell))
+        return who.site.jobs.begin(kind, case, who.speaker.person, work)
     except UsageError as e:
         raise HTTPException(409, str(e)) from None
 
@@ -44,11 +49,7 @@ async def scan(case: CaseId, asked: NewScan, who: Who) -> Job:
 async def carry(case: CaseId, asked: AskedCarry, who: Who) -> Job:
     """Lays the strokes of a stale version on the present scan, as a job: for the operator to look at."""
     await run_in_threadpool(who.case, case, "carry_over")
-    lab = who.site.lab
-    try:
-        return who.site.jobs.begin("carry", case, who.speaker.person, lambda tell: lab.carry(case, asked.version, tell))
-    except UsageError as e:
-        raise HTTPException(409, str(e)) from None
+    return _begin(who, "carry", case, lambda tell: who.site.lab.carry(case, asked.version, tell))
 
 
 @router.post("/cases/{case}/carry_over", tags=["scans"], responses=problems(400, 401, 403, 404))
@@ -69,14 +70,10 @@ async def carry_over(case: CaseId, op: Op, who: Who) -> Said:
 async def compare(case: CaseId, asked: AskedCompare, who: Who) -> Job:
     """What was cut from one scan of a case to another, as a job; its maps and figures go into the case."""
     await run_in_threadpool(who.case, case, "scan.take")
-    lab = who.site.lab
-    try:
-        return who.site.jobs.begin(
-            "compare", case, who.speaker.person,
-            lambda tell: lab.compare(case, asked.before, asked.after, asked.version, tell),
-        )  # fmt: skip
-    except UsageError as e:
-        raise HTTPException(409, str(e)) from None
+    return _begin(
+        who, "compare", case,
+        lambda tell: who.site.lab.compare(case, asked.before, asked.after, asked.version, tell),
+    )  # fmt: skip
 
 
 @router.get("/cases/{case}/files", tags=["scans"], responses=problems(401, 403, 404))
@@ -172,21 +169,14 @@ async def stop(who: Who) -> Ended:
 async def pose(asked: NewPose, who: Who) -> Job:
     """Photographs the calibration board where it lies now, as a job; the first pose says which board it is."""
     who.must("instrument.calibrate")
-    board, lab = asked.board, who.site.lab
-    try:
-        return who.site.jobs.begin("pose", None, who.speaker.person, lambda tell: lab.pose(board, tell))
-    except UsageError as e:
-        raise HTTPException(409, str(e)) from None
+    return _begin(who, "pose", None, lambda tell: who.site.lab.pose(asked.board, tell))
 
 
 @router.post("/instrument/calibrate", status_code=202, tags=["instrument"], responses=problems(401, 403, 409))
 async def calibrate(who: Who) -> Job:
     """The poses so far to a rig, as a job; scans are made with it from then on."""
     who.must("instrument.calibrate")
-    try:
-        return who.site.jobs.begin("calibrate", None, who.speaker.person, who.site.lab.calibrate)
-    except UsageError as e:
-        raise HTTPException(409, str(e)) from None
+    return _begin(who, "calibrate", None, who.site.lab.calibrate)
 
 
 @router.post("/instrument/simulate", tags=["instrument"], responses=problems(401, 409))
