@@ -69,7 +69,10 @@ def places(stroke: Stroke, points: F64, tissue: Tissue, s: GuideSettings) -> F64
         out = _seen(points, stroke.camera, tissue, s)
         return np.where((out.source == Source.NOBODY)[:, None], np.nan, out.xyz)
     uv = geometry.project(tissue.rig.projector, points)
-    return np.where((_gap(points, uv, tissue)[0] > -s.off_surface_mm)[:, None], points, np.nan)
+    gap, slack = _gap(points, uv, tissue)
+    with np.errstate(invalid="ignore"):
+        there = np.abs(gap) <= s.off_surface_mm + slack
+    return np.where(there[:, None], points, np.nan)
 
 
 # ------------------------------------------------------------------------------------------------------- photographs
@@ -90,7 +93,7 @@ def from_photograph(pixels: F64, camera: str, closed: bool, tissue: Tissue, s: G
     path, beside = clipped(path, np.array([-3.0, -3.0]), np.array([W + 2.0, H + 2.0]))
     dense, _ = resampled(path, max(0.5, s.sample_mm / footprint), s.max_samples, beside, s.jump_mm / footprint)
     out = _seen(dense, camera, tissue, s)
-    xyz, guessed = _bridged(out.xyz)
+    xyz, guessed = bridged(out.xyz)
     piece, jumps = _pieces(xyz, guessed, dense, footprint, s)
     off = ~((dense >= -0.5).all(1) & (dense[:, 0] < W - 0.5) & (dense[:, 1] < H - 0.5))
     notes = []
@@ -157,7 +160,7 @@ def _along_rays(origin: F64, rays: F64, tissue: Tissue, number: int) -> F64:
     return out
 
 
-def _bridged(xyz: F64) -> tuple[F64, Bool]:
+def bridged(xyz: F64) -> tuple[F64, Bool]:
     """Places with holes guessed on straight lines between what lies around them, and which are guesses."""
     known = np.asarray(np.isfinite(xyz).all(1))
     if known.all() or not known.any():
