@@ -130,7 +130,7 @@ def _size(
     inside: Inside | None, line: Samples, t: Trace, tissue: Tissue
 ) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
     """Area of what is enclosed, with its sigma, and what is to be said of it."""
-    dark = ()
+    dark: tuple[str, ...] = ()
     if inside is not None and inside.dark > 0.005:
         dark = (f"its outline is not on what the projector lights: {inside.dark:.0%} of what it encloses stays dark",)
     if inside is None or not inside.share.any():

@@ -66,7 +66,7 @@ def places(stroke: Stroke, points: F64, tissue: Tissue, s: GuideSettings) -> F64
     """Single points of a stroke on the tissue (n, 3), NaN where there is none."""
     if stroke.pixels is not None:
         assert stroke.camera is not None
-        out = _seen(points, stroke.camera, tissue, s)
+        out = seen(points, stroke.camera, tissue, s)
         return np.where((out.source == Source.NOBODY)[:, None], np.nan, out.xyz)
     uv = geometry.project(tissue.rig.projector, points)
     gap, slack = _gap(points, uv, tissue)
@@ -92,7 +92,7 @@ def from_photograph(pixels: F64, camera: str, closed: bool, tissue: Tissue, s: G
     H, W = tissue.grids[number].reasons.shape
     path, beside = clipped(path, np.array([-3.0, -3.0]), np.array([W + 2.0, H + 2.0]))
     dense, _ = resampled(path, max(0.5, s.sample_mm / footprint), s.max_samples, beside, s.jump_mm / footprint)
-    out = _seen(dense, camera, tissue, s)
+    out = seen(dense, camera, tissue, s)
     xyz, guessed = bridged(out.xyz)
     piece, jumps = _pieces(xyz, guessed, dense, footprint, s)
     off = ~((dense >= -0.5).all(1) & (dense[:, 0] < W - 0.5) & (dense[:, 1] < H - 0.5))
@@ -107,7 +107,7 @@ def from_photograph(pixels: F64, camera: str, closed: bool, tissue: Tissue, s: G
     return Samples(xyz, out.source, out.ray, out.sigma, piece, tuple(notes))
 
 
-def _seen(pixels: F64, camera: str, tissue: Tissue, s: GuideSettings) -> Samples:
+def seen(pixels: F64, camera: str, tissue: Tissue, s: GuideSettings) -> Samples:
     """Pixels (n, 2) of a camera on the tissue: by its own points, else by what others measured along the ray."""
     number = tissue.number(camera)
     grid, footprint = tissue.grids[number], tissue.footprints[number]

@@ -98,7 +98,7 @@ def of_outline(t: Trace, tissue: Tissue, s: GuideSettings) -> Inside | None:
 def _outline_gaps(t: Trace, tissue: Tissue, s: GuideSettings) -> tuple[Bool, F64]:
     """How far places of an outline lie behind what is lit (n,), mm, 0 where they are on it; and where that is known."""
     p, r = tissue.rig.projector, tissue.relief
-    known = np.isfinite(t.uv).all(1) & np.isfinite(t.xyz).all(1)
+    known = np.asarray(np.isfinite(t.uv).all(1) & np.isfinite(t.xyz).all(1))
     depth = geometry.transform(p.pose, t.xyz)[:, 2]
     raw, slack = known_gap(t.xyz, t.uv, tissue)
     raw = np.where(np.isfinite(raw), raw, depth - r.depth_at(t.uv))
@@ -113,7 +113,7 @@ def _outline_gaps(t: Trace, tissue: Tissue, s: GuideSettings) -> tuple[Bool, F64
         beside = np.where(np.abs(beside) > s.off_surface_mm, beside, 0.0)
         gaps = np.where(np.isfinite(raw), np.where(near, 0.0, raw), beside)
     gaps[t.why == 0] = 0.0
-    return known & np.isfinite(gaps), np.nan_to_num(gaps)
+    return np.asarray(known & np.isfinite(gaps)), np.nan_to_num(gaps)
 
 
 def _between(at: F64, value: F64, low: Any, size: tuple[int, int]) -> F32:
@@ -145,6 +145,6 @@ def of_ways(ways: F64, whole: Bool, projector: Projector) -> Inside | None:
 
 def _strips(uv: F64, whole: Bool) -> Sequence[F64]:
     """The polygons between each two ways, to where they part."""
-    there = np.isfinite(uv).all(2)
+    there = np.asarray(np.isfinite(uv).all(2))
     lasts = np.logical_and.accumulate(whole & there[:, 1:] & there[:, :-1], axis=0).sum(0)
     return [np.concatenate([uv[:n, i], uv[:n, i + 1][::-1]]) for i, n in enumerate(lasts.tolist()) if n > 1]

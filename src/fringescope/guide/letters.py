@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fringescope import geometry
 from fringescope.errors import GuidanceError
 from fringescope.guide import fills
-from fringescope.guide.drape import places, resampled
+from fringescope.guide.drape import Source, in_shadow, places, resampled, seen
 from fringescope.guide.inside import window
 from fringescope.guide.tissue import Tissue
 from fringescope.settings import GuideSettings
-from fringescope.types import F64, Hidden, Stroke
+from fringescope.types import F64, Camera, Hidden, Projector, Stroke
 
 FONT = "DejaVu Sans"  #: comes with matplotlib: the same letters everywhere
 LEAN_DEG = 60.0  #: the plane of the letters leans no more than this against the projector's rays
@@ -66,8 +67,11 @@ def _outlines(stroke: Stroke) -> list[list[F64]]:
 
 
 def letters(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> list[Letter]:
-    """The letters of a text. It starts at the first point, and its base line runs through the second one, as the
-    projector sees it, or to the projector's right; `size_mm` is the height of its lines.
+    """The letters of a text. It starts at the first point, and its base line runs through the second one, or to the
+    projector's right; `size_mm` is the height of its lines.
+
+    They are laid on the mean plane of what they cover and from there, as the camera of the photograph or the projector
+    sees them, on the surface.
     """
     outlines = _outlines(stroke)
     at = places(stroke, stroke.points[:2], tissue, s)
@@ -76,23 +80,46 @@ def letters(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> list[Letter]:
     if len(at) > 1 and not np.isfinite(at[1]).all():
         raise GuidanceError("the point that the text runs towards lies beside the measured surface; move it")
     every = np.concatenate([r for rings in outlines for r in rings])
-    along, up = _plane(at, every.min(0), every.max(0), tissue)
-    return [_letter(rings, at[0], along, up, tissue, s) for rings in outlines]
+    look = _Look(stroke.camera if stroke.pixels is not None else None, tissue, s)
+    along, up = _plane(at, every.min(0), every.max(0), look)
+    return [_letter(rings, at[0], along, up, look) for rings in outlines]
 
 
-def _plane(at: F64, low: F64, high: F64, tissue: Tissue) -> tuple[F64, F64]:
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """From where the text is laid on the surface: a camera, or the projector."""
+
+    camera: str | None
+    tissue: Tissue
+    s: GuideSettings
+
+    @property
+    def device(self) -> Camera | Projector:
+        """The device itself."""
+        if self.camera is None:
+            return self.tissue.rig.projector
+        return self.tissue.rig.cameras[self.tissue.grids[self.tissue.number(self.camera)].view]
+
+    def ground(self, spot: F64) -> tuple[F64, Any]:
+        """The surface behind or before places (n, 3), NaN where there is none, and who says so."""
+        uv = geometry.project(self.device, spot)
+        if self.camera is not None:
+            out = seen(uv, self.camera, self.tissue, self.s)
+            return np.where((out.source == Source.NOBODY)[:, None], np.nan, out.xyz), out.source
+        return self.tissue.relief.at(uv), np.full(len(uv), int(Source.SURFACE))
+
+
+def _plane(at: F64, low: F64, high: F64, look: _Look) -> tuple[F64, F64]:
     """Unit vectors along the base line and up, on the mean plane of what a text covers from `low` to `high`, mm."""
-    p = tissue.rig.projector
-    eye = geometry.centre(p.pose)
+    eye = geometry.centre(look.device.pose)
     light = _unit(eye - at[0])
     normal = light
     x, y = np.meshgrid(np.linspace(low[0], high[0], 40), np.linspace(low[1], high[1], 12))
     for k in range(PLANES + 1):
-        along, up = _axes(at, normal, eye, p.pose.R[0])
+        along, up = _axes(at, normal, eye, look.tissue.rig.projector.pose.R[0])
         if k == PLANES:
             break
-        spot = at[0] + x.ravel()[:, None] * along + y.ravel()[:, None] * up
-        ground = tissue.relief.at(geometry.project(p, spot))
+        ground, _ = look.ground(at[0] + x.ravel()[:, None] * along + y.ravel()[:, None] * up)
         ground = ground[np.isfinite(ground).all(1)]
         if len(ground) < 10:
             break
@@ -105,7 +132,7 @@ def _plane(at: F64, low: F64, high: F64, tissue: Tissue) -> tuple[F64, F64]:
 
 
 def _axes(at: F64, normal: F64, eye: F64, right: F64) -> tuple[F64, F64]:
-    """On the plane through the first place: towards where the projector sees the second one on it, and up from it."""
+    """On the plane through the first place: towards where the second one is seen on it, and up from it."""
     aim = right
     if len(at) > 1:
         ray = at[1] - eye
@@ -120,22 +147,25 @@ def _unit(a: F64) -> F64:
     return np.asarray(a / np.linalg.norm(a))
 
 
-def _letter(outlines: list[F64], start: F64, along: F64, up: F64, tissue: Tissue, s: GuideSettings) -> Letter:
-    projector, relief = tissue.rig.projector, tissue.relief
-    rings, lands, flat = [], [], 0.0
+def _letter(outlines: list[F64], start: F64, along: F64, up: F64, look: _Look) -> Letter:
+    projector, s = look.tissue.rig.projector, look.s
+    rings, lands, who, flat = [], [], [], 0.0
     for outline in outlines:
         xy = resampled(outline, s.sample_mm, s.max_samples)[0]
-        rings.append(geometry.project(projector, start + xy[:, :1] * along + xy[:, 1:] * up))
-        lands.append(relief.at(rings[-1]))
+        spot = start + xy[:, :1] * along + xy[:, 1:] * up
+        ground, source = look.ground(spot)
+        lands.append(ground)
+        who.append(source)
+        rings.append(geometry.project(projector, np.where(np.isfinite(ground), ground, spot)))
         flat += float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())
-    why = _why_not(rings, lands, tissue, s)
+    why = _why_not(rings, lands, np.concatenate(who), look.tissue, s)
     length = flat
     if why is None:
         length = sum(float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in lands)
     return Letter(tuple(lands), tuple(rings), why, length)
 
 
-def _why_not(rings: list[F64], lands: list[F64], tissue: Tissue, s: GuideSettings) -> Hidden | None:
+def _why_not(rings: list[F64], lands: list[F64], source: Any, tissue: Tissue, s: GuideSettings) -> Hidden | None:
     """Why a letter cannot be shown as a whole."""
     projector, relief = tissue.rig.projector, tissue.relief
     every, ground = np.concatenate(rings), np.concatenate(lands)
@@ -151,7 +181,11 @@ def _why_not(rings: list[F64], lands: list[F64], tissue: Tissue, s: GuideSetting
     unit_mm = float(np.nanmedian(depth)) / float(projector.lens.K[0, 0])
     if share[~np.isfinite(depth)].sum() > EDGE_SHARE * share.sum():
         return Hidden.HOLE
+    if in_shadow(ground, every, source, tissue, s).any():
+        return Hidden.SHADOW
     far = max(s.jump_mm, 4 * unit_mm)
+    if any((np.linalg.norm(np.diff(p, axis=0), axis=1) > far).any() for p in lands):
+        return Hidden.HOLE
     depth = np.where(share > 0, depth, np.nan)
     with np.errstate(invalid="ignore"):
         if any((np.abs(np.diff(depth, axis=axis)) > far).any() for axis in (0, 1)):  # it would be torn apart
