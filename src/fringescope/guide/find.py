@@ -23,6 +23,9 @@ from fringescope.types import F32, F64, AnyArray, Bool, Camera, Fill, Grid, Guid
 
 REACHES = 61  #: places across a line at which its centre is tried, before it is refined
 SIDE_PIXELS = 5  #: of a line's profile, and of the ground to each side of it, must be seen
+SIZES = (10, 20, 40)  #: pixels around stations that are looked at, by which they are taken together
+BLUR_PIXELS = 0.4  #: softness of a camera's pictures (standard deviation)
+DARK = 0.03  #: light, as a share of that of all mirrors, that is none
 SLOPE_LEAST = 0.5  #: pixels that a line must move for a mm across
 
 
@@ -147,12 +150,40 @@ def _find(
     projector's plane, where a line keeps its width whatever it lies on. NaN where the line is not found: too little
     light, saturated, one side of it not seen, or a profile that is not that of a line.
     """
-    half = st.half / st.per_mm
-    R = math.ceil(float(np.max(np.hypot((half + s.search_mm) * np.abs(slope), st.reach * pace)))) + 1
-    stride = max(1, int(2 * R / 40))  # many pixels do not make it better
-    steps = np.arange(-R, R + 1, stride)
+    size = np.hypot((st.half / st.per_mm + s.search_mm) * np.abs(slope), st.reach * pace)
+    found, error = np.full(len(at), np.nan), np.full(len(at), np.nan)
+    seen: list[tuple[Any, _Profiles]] = []
+    for low, high in zip((0, *SIZES), (*SIZES, np.inf), strict=True):
+        if (some := np.flatnonzero((size > low) & (size <= high))).size:
+            R = math.ceil(float(size[some].max())) + 1
+            seen.append((some, _profiles(shot, grid, st.of(some), at[some], R, projector)))
+    levels = _levels([p for _, p in seen])
+    for some, p in seen:
+        width = np.hypot(s.blur_mm, BLUR_PIXELS / np.abs(slope[some]))
+        found[some], error[some] = _fit(p, levels, st.search[some], width, np.abs(slope[some]), s)
+    return found, error
+
+
+@dataclass(frozen=True, eq=False)
+class _Profiles:
+    """Pixels around n stations: how far across the line they lie (n, m), mm, their light as a share of that of all
+    mirrors, their weights (0: not to be used); the columns of each kind of pixel of a colour mosaic; half the line's
+    width (n,), mm.
+    """
+
+    x: F64
+    y: F64
+    w: F64
+    kinds: list[Any]
+    half: F64
+
+
+def _profiles(shot: Shots, grid: Grid, st: Stations, at: F64, R: int, projector: Projector) -> _Profiles:
+    """The profiles of lines in a picture, within R pixels of the stations."""
+    stride = max(1, int(2 * R / 40)) | 1  # many pixels do not make it better; odd, to meet all kinds of them
+    steps = np.arange(-stride * math.ceil(R / stride), R + 2, stride)
     dv, du = (a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
-    base = np.floor(at + 0.5).astype(np.intp)
+    base = 2 * np.floor(0.5 * at + 0.25).astype(np.intp)  # even: the mosaic is the same around each
     H, W = shot.dark.shape[:2]
     c, r = base[:, :1] + du, base[:, 1:] + dv
     inside = (c >= 0) & (c < W) & (r >= 0) & (r < H)
@@ -165,13 +196,14 @@ def _find(
     top = float(shot.pixel_format.max_value)
     with np.errstate(invalid="ignore"):
         usable = inside & (x >= st.low[:, None]) & (x <= st.high[:, None]) & (np.abs(along) <= st.reach[:, None])
-    x = np.where(usable, x, 0.0)
     usable &= (white < top) & (lit < top) & (white - dark > 4 * top / 255)
     full = np.where(usable, white - dark, 1.0)
-    ratio = np.where(usable, (lit - dark) / full, 0.0)
-    kind = (rr % 2) * 2 + cc % 2 if shot.pixel_format.is_bayer else np.zeros_like(rr)
-    weight, ratio = _one_scale(ratio, full * usable, kind, np.abs(x) <= half[:, None], usable)
-    return _fit(x, ratio, weight, half, st.search, np.hypot(s.blur_mm, 0.4 / np.abs(slope)), np.abs(slope), s)
+    kinds = [np.arange(len(du))]
+    if shot.pixel_format.is_bayer:
+        kinds = [np.flatnonzero((dv % 2 == i) & (du % 2 == j)) for i in (0, 1) for j in (0, 1)]
+    return _Profiles(
+        np.where(usable, x, 0.0), np.where(usable, (lit - dark) / full, 0.0), full * usable, kinds, st.half / st.per_mm
+    )
 
 
 def _sampled(frame: AnyArray, r: Any, c: Any) -> F32:
@@ -179,52 +211,63 @@ def _sampled(frame: AnyArray, r: Any, c: Any) -> F32:
     return np.asarray(f.mean(-1) if f.ndim == 3 else f, np.float32)
 
 
-def _one_scale(ratio: F32, full: F32, kind: Any, middle: Bool, usable: Bool) -> tuple[F64, F64]:
-    """Weights, and ratios as multiples of what each kind of pixel (of a colour mosaic) shows of the line's colour."""
-    weight, out = np.zeros(ratio.shape), np.zeros(ratio.shape)
-    for k in range(int(kind.max()) + 1 if kind.size else 0):
-        mine = (kind == k) & usable
-        core = mine & middle
-        if core.sum() < 5:
-            continue
-        level = float(np.percentile(ratio[core], 80))
-        if level < 0.03:
-            continue
-        out[mine] = ratio[mine] / level
-        weight[mine] = (full[mine] * level) ** 2 / np.maximum(full[mine], 1.0)
-    return weight, out
+def _levels(profiles: Sequence[_Profiles]) -> list[float]:
+    """How bright the middle of the line is to each kind of pixel, as a share of the light of all mirrors; 0 = dark."""
+    out = []
+    for k in range(max((len(p.kinds) for p in profiles), default=0)):
+        core = [p.y[:, c][(p.w[:, c] > 0) & (np.abs(p.x[:, c]) <= p.half[:, None])] for p in profiles for c in [p.kinds[k]]]
+        every = np.concatenate(core)
+        level = float(np.percentile(every, 80)) if len(every) >= 5 else 0.0
+        out.append(level if level >= DARK else 0.0)
+    return out
 
 
 def _fit(
-    x: F64, y: F64, w: F64, half: F64, search: F64, blur: F64, per_mm: F64, s: LoopSettings
+    p: _Profiles, levels: Sequence[float], search: F64, blur: F64, per_mm: F64, s: LoopSettings
 ) -> tuple[F64, F64]:
-    """Centre of a line's profile `y` (n, m) at `x`, weights `w`: least squares over place, height and ground; mm."""
+    """Centres of lines (n,), mm, and their errors: least squares over the place, and the height and ground that each
+    kind of pixel sees.
+    """
     from scipy.special import erf
 
-    n = len(x)
-    out, error = np.full(n, np.nan), np.full(n, np.nan)
-    there = w > 0
-    sides = [x < -half[:, None], np.abs(x) <= half[:, None], x > half[:, None]]
-    rows = np.flatnonzero(np.all([(there & side).sum(1) >= SIDE_PIXELS for side in sides], axis=0))
+    out, error = np.full(len(p.x), np.nan), np.full(len(p.x), np.nan)
+    kinds = [(c, level) for c, level in zip(p.kinds, levels, strict=True) if level]
+    if not kinds:
+        return out, error
+    every = np.concatenate([c for c, _ in kinds])
+    cuts = np.concatenate([[0], np.cumsum([len(c) for c, _ in kinds])])
+    x, y, w = p.x[:, every], p.y[:, every], p.w[:, every]
+    half = p.half[:, None]
+    sides = [x < -half, np.abs(x) <= half, x > half]
+    rows = np.flatnonzero(np.all([((w > 0) & side).sum(1) >= SIDE_PIXELS for side in sides], axis=0))
     if not rows.size:
         return out, error
-    x, y, w, half, span, blur, per_mm = (a[rows] for a in (x, y, w, half, search, blur, per_mm))
-    soft = (math.sqrt(2) * blur)[:, None]
+    x, y, w, half, span, soft, per_mm = (a[rows] for a in (x, y, w, half, search, blur, per_mm))
+    soft = math.sqrt(2) * soft[:, None]
+
+    def sums(a: F64) -> F64:
+        return np.asarray(np.add.reduceat(a, cuts[:-1], axis=1))
+
+    wy = w * y
+    s0, sy, syy = sums(w), sums(wy), sums(wy * y)
+    level = np.array([level for _, level in kinds])
+    expected = (s0 * level).sum(1)
 
     def cost(centre: F64) -> tuple[F64, F64, F64]:
+        """What is left of the light's squares with lines at `centre`; their height, of what it should be, and power."""
         d = x - centre[:, None]
-        t = 0.5 * (erf((d + half[:, None]) / soft) - erf((d - half[:, None]) / soft))
-        s0, st, stt = w.sum(1), (w * t).sum(1), (w * t * t).sum(1)
-        sy, sty, syy = (w * y).sum(1), (w * t * y).sum(1), (w * y * y).sum(1)
+        t = 0.5 * (erf((d + half) / soft) - erf((d - half) / soft))
+        wt = w * t
+        st, stt, sty = sums(wt), sums(wt * t), sums(wt * y)
         det = s0 * stt - st * st
-        det = np.where(det > 0, det, np.nan)
-        height = (s0 * sty - st * sy) / det
-        ground = (stt * sy - st * sty) / det
-        return syy - height * sty - ground * sy, height, s0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            height = np.where(det > 1e-6 * s0 * s0, (s0 * sty - st * sy) / det, 0.0)
+            ground = np.where(s0 > 0, (sy - st * height) / s0, 0.0)
+        left = syy - height * sty - ground * sy
+        return left.sum(1), (s0 * height).sum(1) / expected, (s0 * height**2).sum(1)
 
     tries = np.linspace(-1, 1, REACHES)
     table = np.stack([cost(c * span)[0] for c in tries], 1)
-    table = np.where(np.isfinite(table), table, np.inf)
     best = table.argmin(1)
     centre = tries[best] * span
     inner = (best > 0) & (best < REACHES - 1)
@@ -236,13 +279,12 @@ def _fit(
             move = np.where(bend > 0, 0.5 * (low - high) / bend, 0.0) * step
         centre = centre + np.clip(np.nan_to_num(move), -step, step)
         step = 0.4 * step
-    left, height, total = cost(centre)
+    left, height, power = cost(centre)
     bend = cost(centre + step)[0] - 2 * left + cost(centre - step)[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         noise = left / np.maximum((w > 0).sum(1) - 3, 1)
         err = np.sqrt(2 * np.maximum(noise, 0) / (bend / step**2))
-        misfit = np.sqrt(np.maximum(left, 0) / total)
-        good = inner & (height > s.min_height) & (misfit < s.max_misfit * height)
+        good = inner & (height > s.min_height) & (left < s.max_misfit**2 * power)
         good &= np.isfinite(err) & (err * per_mm < 0.5)
     out[rows[good]] = centre[good]
     error[rows[good]] = np.maximum(err[good], 0.01 / per_mm[good])
