@@ -23,8 +23,10 @@ from fringescope.types import F32, F64, AnyArray, Bool, Camera, Fill, Grid, Guid
 
 REACHES = 61  #: places across a line at which its centre is tried, before it is refined
 SIDE_PIXELS = 5  #: of a line's profile, and of the ground to each side of it, must be seen
+KIND_PIXELS = 2  #: the same, of each kind of pixel of a colour mosaic
 SIZES = (10, 20, 40)  #: pixels around stations that are looked at, by which they are taken together
-BLUR_PIXELS = 0.4  #: softness of a camera's pictures (standard deviation)
+BLUR_PIXELS = 0.6  #: softness of a camera's pictures (standard deviation)
+SOFTER = (0.7, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0)  #: than expected that lines may be
 DARK = 0.03  #: light, as a share of that of all mirrors, that is none
 SLOPE_LEAST = 0.5  #: pixels that a line must move for a mm across
 
@@ -71,11 +73,13 @@ def _landing(name: str, st: Stations, shots: Sequence[Shots], tissue: Tissue, s:
         views.append(grid.view)
         camera = tissue.rig.cameras[grid.view]
         seen[k] = _sees(tissue, tissue.number(shot.camera), st.place)
-        at, slopes[k], pace = _in_picture(camera, st)
+        at, side, slopes[k], pace = _in_picture(camera, st)
         look = np.flatnonzero(seen[k] & fit_for & (np.abs(slopes[k, :, 0]) > SLOPE_LEAST))
         if look.size:
             some = st.of(look)
-            mm, error = _find(shot, grid, some, at[look], slopes[k, look, 0], pace[look], tissue.rig.projector, s)
+            mm, error = _find(
+                shot, grid, some, at[look], side[look], slopes[k, look, 0], pace[look], tissue.rig.projector, s
+            )
             offset[k, look], sigma[k, look] = mm * slopes[k, look, 0], error * np.abs(slopes[k, look, 0])
     found, height = _triangulate(offset, sigma, slopes, s)
     ok = np.isfinite(found)
@@ -123,9 +127,9 @@ def _sees(tissue: Tissue, number: int, place: F64) -> Bool:
     return np.asarray(ok & (g.reasons[r, c] == 0) & (near < 0.2 + 1.5 * tissue.footprints[number]))
 
 
-def _in_picture(camera: Camera, st: Stations) -> tuple[F64, F64, F64]:
-    """Stations in a picture: their pixels (n, 2), how far the line moves across itself for a mm across and a mm up
-    (n, 2), pixels, and pixels per mm along it (n,).
+def _in_picture(camera: Camera, st: Stations) -> tuple[F64, F64, F64, F64]:
+    """Stations in a picture: their pixels (n, 2), the unit direction across the line (n, 2), how far the line moves so
+    for a mm across and a mm up (n, 2), pixels, and pixels per mm along it (n,).
     """
     h = 0.05
 
@@ -138,11 +142,12 @@ def _in_picture(camera: Camera, st: Stations) -> tuple[F64, F64, F64]:
     line = along / np.maximum(pace, 1e-9)[:, None]
     side = np.stack([-line[:, 1], line[:, 0]], 1)
     side *= np.sign((side * across).sum(1))[:, None]
-    return geometry.project(camera, st.place), np.stack([(side * across).sum(1), (side * up).sum(1)], 1), pace
+    return geometry.project(camera, st.place), side, np.stack([(side * across).sum(1), (side * up).sum(1)], 1), pace
 
 
 def _find(
-    shot: Shots, grid: Grid, st: Stations, at: F64, slope: F64, pace: F64, projector: Projector, s: LoopSettings
+    shot: Shots, grid: Grid, st: Stations, at: F64, side: F64, slope: F64, pace: F64, projector: Projector,
+    s: LoopSettings,
 ) -> tuple[F64, F64]:
     """How far across the line (n,), mm, from where it should be its light is centred, and the error of that.
 
@@ -156,7 +161,7 @@ def _find(
     for low, high in zip((0, *SIZES), (*SIZES, np.inf), strict=True):
         if (some := np.flatnonzero((size > low) & (size <= high))).size:
             R = math.ceil(float(size[some].max())) + 1
-            seen.append((some, _profiles(shot, grid, st.of(some), at[some], R, projector)))
+            seen.append((some, _profiles(shot, grid, st.of(some), at[some], side[some], slope[some], R, projector)))
     levels = _levels([p for _, p in seen])
     for some, p in seen:
         width = np.hypot(s.blur_mm, BLUR_PIXELS / np.abs(slope[some]))
@@ -168,7 +173,7 @@ def _find(
 class _Profiles:
     """Pixels around n stations: how far across the line they lie (n, m), mm, their light as a share of that of all
     mirrors, their weights (0: not to be used); the columns of each kind of pixel of a colour mosaic; half the line's
-    width (n,), mm.
+    width (n,), mm, and half its curvature, 1/mm.
     """
 
     x: F64
@@ -176,9 +181,12 @@ class _Profiles:
     w: F64
     kinds: list[Any]
     half: F64
+    bow: F64
 
 
-def _profiles(shot: Shots, grid: Grid, st: Stations, at: F64, R: int, projector: Projector) -> _Profiles:
+def _profiles(
+    shot: Shots, grid: Grid, st: Stations, at: F64, side: F64, slope: F64, R: int, projector: Projector
+) -> _Profiles:
     """The profiles of lines in a picture, within R pixels of the stations."""
     stride = max(1, int(2 * R / 40)) | 1  # many pixels do not make it better; odd, to meet all kinds of them
     steps = np.arange(-stride * math.ceil(R / stride), R + 2, stride)
@@ -198,12 +206,29 @@ def _profiles(shot: Shots, grid: Grid, st: Stations, at: F64, R: int, projector:
         usable = inside & (x >= st.low[:, None]) & (x <= st.high[:, None]) & (np.abs(along) <= st.reach[:, None])
     usable &= (white < top) & (lit < top) & (white - dark > 4 * top / 255)
     full = np.where(usable, white - dark, 1.0)
+    # a camera's blur draws the line's edge to where the tissue is brighter
+    x = x + _gradient(shot, rr, cc, side) * (BLUR_PIXELS**2 / slope)[:, None]
     kinds = [np.arange(len(du))]
     if shot.pixel_format.is_bayer:
         kinds = [np.flatnonzero((dv % 2 == i) & (du % 2 == j)) for i in (0, 1) for j in (0, 1)]
     return _Profiles(
-        np.where(usable, x, 0.0), np.where(usable, (lit - dark) / full, 0.0), full * usable, kinds, st.half / st.per_mm
-    )
+        np.where(usable, x, 0.0), np.where(usable, (lit - dark) / full, 0.0), full * usable, kinds, st.half / st.per_mm,
+        st.bend * st.pace**2 / st.per_mm,
+    )  # fmt: skip
+
+
+def _gradient(shot: Shots, r: Any, c: Any, side: F64) -> F64:
+    """By how much the logarithm of what all mirrors light grows for a pixel across the line (n, m)."""
+    far = 2 if shot.pixel_format.is_bayer else 1
+    H, W = shot.dark.shape[:2]
+    floor = 4 * float(shot.pixel_format.max_value) / 255
+
+    def log(dr: int, dc: int) -> F64:
+        at = np.clip(r + dr, 0, H - 1), np.clip(c + dc, 0, W - 1)
+        return np.asarray(np.log(np.maximum(_sampled(shot.white, *at) - _sampled(shot.dark, *at), floor)))
+
+    across, down = (log(0, far) - log(0, -far)) / (2 * far), (log(far, 0) - log(-far, 0)) / (2 * far)
+    return np.asarray(across * side[:, :1] + down * side[:, 1:])
 
 
 def _sampled(frame: AnyArray, r: Any, c: Any) -> F32:
@@ -215,7 +240,10 @@ def _levels(profiles: Sequence[_Profiles]) -> list[float]:
     """How bright the middle of the line is to each kind of pixel, as a share of the light of all mirrors; 0 = dark."""
     out = []
     for k in range(max((len(p.kinds) for p in profiles), default=0)):
-        core = [p.y[:, c][(p.w[:, c] > 0) & (np.abs(p.x[:, c]) <= p.half[:, None])] for p in profiles for c in [p.kinds[k]]]
+        core = []
+        for p in profiles:
+            c = p.kinds[k]
+            core.append(p.y[:, c][(p.w[:, c] > 0) & (np.abs(p.x[:, c]) <= p.half[:, None])])
         every = np.concatenate(core)
         level = float(np.percentile(every, 80)) if len(every) >= 5 else 0.0
         out.append(level if level >= DARK else 0.0)
@@ -238,12 +266,14 @@ def _fit(
     cuts = np.concatenate([[0], np.cumsum([len(c) for c, _ in kinds])])
     x, y, w = p.x[:, every], p.y[:, every], p.w[:, every]
     half = p.half[:, None]
+    # a kind of pixel that sees the line from one side only, or in part, does not tell where it is
+    counts = [np.add.reduceat((w > 0) & side, cuts[:-1], axis=1) for side in (x < -half, np.abs(x) <= half, x > half)]
+    w = w * np.repeat(np.all([n >= KIND_PIXELS for n in counts], axis=0), np.diff(cuts), axis=1)
     sides = [x < -half, np.abs(x) <= half, x > half]
     rows = np.flatnonzero(np.all([((w > 0) & side).sum(1) >= SIDE_PIXELS for side in sides], axis=0))
     if not rows.size:
         return out, error
-    x, y, w, half, span, soft, per_mm = (a[rows] for a in (x, y, w, half, search, blur, per_mm))
-    soft = math.sqrt(2) * soft[:, None]
+    x, y, w, half, span, blur, per_mm, bow = (a[rows] for a in (x, y, w, half, search, blur, per_mm, p.bow))
 
     def sums(a: F64) -> F64:
         return np.asarray(np.add.reduceat(a, cuts[:-1], axis=1))
@@ -253,9 +283,13 @@ def _fit(
     level = np.array([level for _, level in kinds])
     expected = (s0 * level).sum(1)
 
-    def cost(centre: F64) -> tuple[F64, F64, F64]:
-        """What is left of the light's squares with lines at `centre`; their height, of what it should be, and power."""
-        d = x - centre[:, None]
+    def cost(centre: F64, blur: F64) -> tuple[F64, F64, F64]:
+        """What is left of the light's squares with lines at `centre`; their height, of what it should be, and power.
+
+        A blurred line that bends is brighter on the inner side of its bend.
+        """
+        soft = math.sqrt(2) * blur[:, None]
+        d = x - (centre + bow * blur**2)[:, None]
         t = 0.5 * (erf((d + half) / soft) - erf((d - half) / soft))
         wt = w * t
         st, stt, sty = sums(wt), sums(wt * t), sums(wt * y)
@@ -266,21 +300,29 @@ def _fit(
         left = syy - height * sty - ground * sy
         return left.sum(1), (s0 * height).sum(1) / expected, (s0 * height**2).sum(1)
 
+    def refined(centre: F64, step: F64, blur: F64) -> tuple[F64, F64]:
+        for _ in range(3):  # a parabola through three costs, ever closer
+            low, mid, high = (cost(centre + d, blur)[0] for d in (-step, 0.0, step))
+            bend = low - 2 * mid + high
+            with np.errstate(invalid="ignore", divide="ignore"):
+                move = np.where(bend > 0, 0.5 * (low - high) / bend, 0.0) * step
+            centre = centre + np.clip(np.nan_to_num(move), -step, step)
+            step = 0.4 * step
+        return centre, step
+
     tries = np.linspace(-1, 1, REACHES)
-    table = np.stack([cost(c * span)[0] for c in tries], 1)
+    table = np.stack([cost(c * span, blur)[0] for c in tries], 1)
     best = table.argmin(1)
-    centre = tries[best] * span
     inner = (best > 0) & (best < REACHES - 1)
-    step = (tries[1] - tries[0]) * span
-    for _ in range(3):  # a parabola through three costs, ever closer
-        low, mid, high = (cost(centre + d)[0] for d in (-step, 0.0, step))
-        bend = low - 2 * mid + high
-        with np.errstate(invalid="ignore", divide="ignore"):
-            move = np.where(bend > 0, 0.5 * (low - high) / bend, 0.0) * step
-        centre = centre + np.clip(np.nan_to_num(move), -step, step)
-        step = 0.4 * step
-    left, height, power = cost(centre)
-    bend = cost(centre + step)[0] - 2 * left + cost(centre - step)[0]
+    first = (tries[1] - tries[0]) * span
+    centre, _ = refined(tries[best] * span, first, blur)
+    # how soft the lines are is told by all of them together
+    softer = [float((left / np.maximum(power, 1e-9))[inner].sum()) for left, _, power in
+              (cost(centre, f * blur) for f in SOFTER)]  # fmt: skip
+    blur = SOFTER[int(np.argmin(softer))] * blur
+    centre, step = refined(centre, 0.4 * first, blur)
+    left, height, power = cost(centre, blur)
+    bend = cost(centre + step, blur)[0] - 2 * left + cost(centre - step, blur)[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         noise = left / np.maximum((w > 0).sum(1) - 3, 1)
         err = np.sqrt(2 * np.maximum(noise, 0) / (bend / step**2))
