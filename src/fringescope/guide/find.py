@@ -22,8 +22,10 @@ from fringescope.settings import LoopSettings
 from fringescope.types import F32, F64, AnyArray, Bool, Camera, Fill, Grid, Guidance, Landing, PixelFormat, Projector
 
 REACHES = 61  #: places across a line at which its centre is tried, before it is refined
-SIDE_PIXELS = 5  #: of a line's profile, and of the ground to each side of it, must be seen
-KIND_PIXELS = 2  #: the same, of each kind of pixel of a colour mosaic
+LEAST = 2  #: pixels of a line's profile, and of the ground to each side of it, must be seen
+SIDE_SHARE = 0.25  #: and this share of those that there are
+FEW = 16  #: pixels of each kind of a colour mosaic around a station: with fewer they are taken together
+KIND_SHARE = 0.3  #: the same, of each kind of pixel of a colour mosaic, of what the best of them sees
 SIZES = (10, 20, 40)  #: pixels around stations that are looked at, by which they are taken together
 BLUR_PIXELS = 0.6  #: softness of a camera's pictures (standard deviation)
 SOFTER = (0.7, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0)  #: than expected that lines may be
@@ -161,7 +163,8 @@ def _find(
     for low, high in zip((0, *SIZES), (*SIZES, np.inf), strict=True):
         if (some := np.flatnonzero((size > low) & (size <= high))).size:
             R = math.ceil(float(size[some].max())) + 1
-            seen.append((some, _profiles(shot, grid, st.of(some), at[some], side[some], slope[some], R, projector)))
+            lines = (a[some] for a in (at, side, slope, pace))
+            seen.append((some, _profiles(shot, grid, st.of(some), *lines, R, projector)))
     levels = _levels([p for _, p in seen])
     for some, p in seen:
         width = np.hypot(s.blur_mm, BLUR_PIXELS / np.abs(slope[some]))
@@ -173,7 +176,7 @@ def _find(
 class _Profiles:
     """Pixels around n stations: how far across the line they lie (n, m), mm, their light as a share of that of all
     mirrors, their weights (0: not to be used); the columns of each kind of pixel of a colour mosaic; half the line's
-    width (n,), mm, and half its curvature, 1/mm.
+    width (n,), mm, and half its curvature, 1/mm; how many pixels there are to its left, on it and to its right (n, 3).
     """
 
     x: F64
@@ -182,10 +185,11 @@ class _Profiles:
     kinds: list[Any]
     half: F64
     bow: F64
+    room: F64
 
 
 def _profiles(
-    shot: Shots, grid: Grid, st: Stations, at: F64, side: F64, slope: F64, R: int, projector: Projector
+    shot: Shots, grid: Grid, st: Stations, at: F64, side: F64, slope: F64, pace: F64, R: int, projector: Projector
 ) -> _Profiles:
     """The profiles of lines in a picture, within R pixels of the stations."""
     stride = max(1, int(2 * R / 40)) | 1  # many pixels do not make it better; odd, to meet all kinds of them
@@ -211,9 +215,11 @@ def _profiles(
     kinds = [np.arange(len(du))]
     if shot.pixel_format.is_bayer:
         kinds = [np.flatnonzero((dv % 2 == i) & (du % 2 == j)) for i in (0, 1) for j in (0, 1)]
+    half = st.half / st.per_mm
+    widths = np.stack([-st.low - half, 2 * half, st.high - half], 1)
     return _Profiles(
-        np.where(usable, x, 0.0), np.where(usable, (lit - dark) / full, 0.0), full * usable, kinds, st.half / st.per_mm,
-        st.bend * st.pace**2 / st.per_mm,
+        np.where(usable, x, 0.0), np.where(usable, (lit - dark) / full, 0.0), full * usable, kinds, half,
+        st.bend * st.pace**2 / st.per_mm, 2 * (st.reach * pace * np.abs(slope))[:, None] * widths / stride**2,
     )  # fmt: skip
 
 
@@ -264,13 +270,19 @@ def _fit(
         return out, error
     every = np.concatenate([c for c, _ in kinds])
     cuts = np.concatenate([[0], np.cumsum([len(c) for c, _ in kinds])])
+    level = np.array([level for _, level in kinds])
     x, y, w = p.x[:, every], p.y[:, every], p.w[:, every]
     half = p.half[:, None]
-    # a kind of pixel that sees the line from one side only, or in part, does not tell where it is
-    counts = [np.add.reduceat((w > 0) & side, cuts[:-1], axis=1) for side in (x < -half, np.abs(x) <= half, x > half)]
-    w = w * np.repeat(np.all([n >= KIND_PIXELS for n in counts], axis=0), np.diff(cuts), axis=1)
-    sides = [x < -half, np.abs(x) <= half, x > half]
-    rows = np.flatnonzero(np.all([((w > 0) & side).sum(1) >= SIDE_PIXELS for side in sides], axis=0))
+    sides = (x < -half, np.abs(x) <= half, x > half)
+    if np.median((w > 0).sum(1)) < FEW * len(kinds):  # too few for each kind: all see the line as bright as they should
+        scale = np.repeat(level, np.diff(cuts))
+        y, w = y / scale, w * scale**2
+        cuts, level = np.array([0, len(every)]), np.ones(1)
+    else:  # a kind of pixel that sees the line from one side only, or in part, does not tell where it is
+        counts = [np.add.reduceat((w > 0) & side, cuts[:-1], axis=1) for side in sides]
+        w = w * np.repeat(np.all([n >= _enough(n) for n in counts], axis=0), np.diff(cuts), axis=1)
+    counted = np.stack([((w > 0) & side).sum(1) for side in sides], 1)
+    rows = np.flatnonzero((counted >= np.maximum(LEAST, SIDE_SHARE * p.room * len(kinds) / len(p.kinds))).all(1))
     if not rows.size:
         return out, error
     x, y, w, half, span, blur, per_mm, bow = (a[rows] for a in (x, y, w, half, search, blur, per_mm, p.bow))
@@ -280,7 +292,6 @@ def _fit(
 
     wy = w * y
     s0, sy, syy = sums(w), sums(wy), sums(wy * y)
-    level = np.array([level for _, level in kinds])
     expected = (s0 * level).sum(1)
 
     def cost(centre: F64, blur: F64) -> tuple[F64, F64, F64]:
@@ -331,6 +342,11 @@ def _fit(
     out[rows[good]] = centre[good]
     error[rows[good]] = np.maximum(err[good], 0.01 / per_mm[good])
     return out, error
+
+
+def _enough(counts: AnyArray) -> AnyArray:
+    """How many pixels of a kind, of `counts` (n, kinds), are enough (n, 1)."""
+    return np.maximum(1, KIND_SHARE * counts.max(1, keepdims=True))
 
 
 def _triangulate(offset: F64, sigma: F64, slopes: F64, s: LoopSettings) -> tuple[F64, F64]:

@@ -16,7 +16,7 @@ from fringescope.guide.trace import visible_runs
 from fringescope.settings import LoopSettings
 from fringescope.types import F64, Fill, Guidance, Guided, Projector, StrokeKind
 
-END_MM = 0.3  #: a station's piece of line ends so far before the line does
+END_MM = 0.2  #: a station's piece of line ends so far before the line does
 SHORT = 0.5  #: pieces that are looked at where the whole ones are not straight, or too long; of the whole
 BOW_MM = 0.06  #: a line may differ so much from the parabola through the ends and the middle of a piece
 BESIDE_MM = 0.2  #: so much of the ground before another line is left out
