@@ -22,7 +22,7 @@ from fringescope.guide.find import Shots, landings
 from fringescope.guide.inside import Inside
 from fringescope.guide.letters import letters
 from fringescope.guide.tissue import Tissue, tissue
-from fringescope.guide.trace import guided, hidden_parts, mirror_units, trace, visible_runs
+from fringescope.guide.trace import guided, hidden_parts, mirror_units, trace, usual_sigma, visible_runs
 from fringescope.settings import GuideSettings
 from fringescope.types import Fill, Guidance, Guided, Guidelines, HiddenPart, Stroke, StrokeKind, Trace
 
@@ -135,9 +135,8 @@ def _size(
         dark = (f"its outline is not on what the projector lights: {inside.dark:.0%} of what it encloses stays dark",)
     if inside is None or not inside.share.any():
         return None, dark or ("nothing inside it was measured",)
-    sigma = float(np.nanmedian(t.sigma)) if len(t) else 0.0
     outline = line.xyz[np.isfinite(line.xyz).all(1)]
-    size, error, missing = fills.area(inside.share, inside.low, tissue.relief, outline, sigma)
+    size, error, missing = fills.area(inside.share, inside.low, tissue.relief, outline, usual_sigma(t))
     unknown = (f"{missing:.0%} of its area was not measured and is not lit",) if missing > 0.005 else ()
     return (size, error), (*dark, *unknown)
 
