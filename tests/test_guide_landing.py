@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +30,7 @@ def kinds(w: int, h: int) -> tuple[Stroke, ...]:
 
     return (
         Stroke("line", **at((0.37, 0.40), (0.44, 0.44), (0.51, 0.42)), width_mm=0.6),
-        Stroke("closed", **at((0.37, 0.57), (0.42, 0.57), (0.42, 0.66), (0.37, 0.66)), closed=True, color=(0, 255, 136)),
+        Stroke("closed", **at((0.37, 0.57), (0.42, 0.57), (0.42, 0.66), (0.37, 0.66)), closed=True, color=(0, 255, 99)),
         Stroke("solid", StrokeKind.REGION, **at((0.56, 0.40), (0.61, 0.40), (0.61, 0.48)), fill=Fill.SOLID),
         Stroke("hatch", StrokeKind.REGION, **at((0.56, 0.55), (0.64, 0.55), (0.64, 0.66), (0.56, 0.66)),
                fill=Fill.HATCH, spacing_mm=1.25, color=(255, 255, 255), width_mm=0.4),
@@ -64,7 +65,7 @@ def truth_um(found: Landing, g: Any, station: Any) -> np.ndarray:
     near = np.linalg.norm(places[:, None] - lands, axis=2).argmin(1)
     o, d = optics.look(p.lens, p.pose, np.ascontiguousarray(uv[near]))
     landed = shapes.trace(station.world.scene.shapes, o, d).point
-    fine = [a + (b - a) * s for q in g.lands for a, b in zip(q[:-1], q[1:], strict=True) for s in (0, 0.25, 0.5, 0.75)]
+    fine = [a + (b - a) * s for q in g.lands for a, b in itertools.pairwise(q) for s in (0, 0.25, 0.5, 0.75)]
     return np.asarray(1e3 * np.linalg.norm(landed[:, None] - np.array(fine), axis=2).min(1))
 
 

@@ -97,7 +97,7 @@ def _landing(name: str, st: Stations, shots: Sequence[Shots], tissue: Tissue, s:
         float(np.percentile(told, 95)) if len(told) else None,
         float(told.max()) if len(told) else None,
         float(ok[seen.any(0)].mean()) if seen.any() else 0.0,
-        _words(ok, seen.any(0), fit_for, height, s),
+        _words(ok, np.asarray(seen.any(0)), fit_for, height, s),
     )
 
 
@@ -163,8 +163,8 @@ def _find(
     for low, high in zip((0, *SIZES), (*SIZES, np.inf), strict=True):
         if (some := np.flatnonzero((size > low) & (size <= high))).size:
             R = math.ceil(float(size[some].max())) + 1
-            lines = (a[some] for a in (at, side, slope, pace))
-            seen.append((some, _profiles(shot, grid, st.of(some), *lines, R, projector)))
+            where = at[some], side[some], slope[some], pace[some]
+            seen.append((some, _profiles(shot, grid, st.of(some), *where, R, projector)))
     levels = _levels([p for _, p in seen])
     for some, p in seen:
         width = np.hypot(s.blur_mm, BLUR_PIXELS / np.abs(slope[some]))
@@ -346,7 +346,7 @@ def _fit(
 
 def _enough(counts: AnyArray) -> AnyArray:
     """How many pixels of a kind, of `counts` (n, kinds), are enough (n, 1)."""
-    return np.maximum(1, KIND_SHARE * counts.max(1, keepdims=True))
+    return np.asarray(np.maximum(1, KIND_SHARE * counts.max(1, keepdims=True)))
 
 
 def _triangulate(offset: F64, sigma: F64, slopes: F64, s: LoopSettings) -> tuple[F64, F64]:

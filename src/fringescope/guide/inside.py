@@ -20,6 +20,7 @@ from fringescope.types import F32, F64, Bool, Projector, Trace
 OUTLINE = 256  #: places of an outline that say where the tissue inside lies
 UNITS = 10_000  #: units of the plane for which that is worked out; others lie between them
 STEEP = 2.0  #: beside the measured surface, so much of the way there the tissue may have risen or fallen
+SHARD_MM = 1.5  #: narrower parts of a filled circle, where a few ways get on, are not lit
 BLOCK = 4_000_000  #: distances that are held at once
 
 
@@ -140,7 +141,23 @@ def of_ways(ways: F64, whole: Bool, projector: Projector) -> Inside | None:
     if not strips:
         return None
     low, size = window(np.concatenate(strips), projector)
-    return Inside(fills.inside(strips, low, size, union=True), low)
+    share = fills.inside(strips, low, size, union=True)
+    radius = float(np.linalg.norm(np.diff(ways[:, 0], axis=0), axis=1).sum())
+    depth = float(geometry.transform(projector.pose, ways[0, 0])[2])
+    narrow = min(SHARD_MM, 0.5 * radius) * projector.lens.K[0, 0] / depth
+    return Inside(_without_shards(share, uv[0, 0] - low, narrow), low)
+
+
+def _without_shards(share: F32, at: F64, narrow: float) -> F32:
+    """Shares (h, w) without what is narrower than `narrow` units, and what only that joins to the place `at` (u, v)."""
+    size = int(narrow) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    wide = cv2.morphologyEx((share > 0.5).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    _, part = cv2.connectedComponents(wide, connectivity=4)
+    h, w = share.shape
+    u, v = np.clip(np.floor(at + 0.5).astype(int), 0, [w - 1, h - 1])
+    mine = (part == part[v, u]) & (wide > 0)
+    return np.asarray(share * cv2.dilate(mine.astype(np.uint8), np.ones((3, 3), np.uint8)), np.float32)
 
 
 def _strips(uv: F64, whole: Bool) -> Sequence[F64]:
