@@ -110,8 +110,8 @@ def _words(ok: Bool, seen: Bool, fit_for: Bool, height: F64, s: LoopSettings) ->
     else:
         if (share := float(ok[expected].mean()) if expected.any() else 0.0) < 0.5:
             words.append(f"found at {share:.0%} of the places where it should be seen")
-        if seen.any() and (judged := float(fit_for[seen].mean())) < 0.5:
-            words.append(f"only {judged:.0%} of it can be judged: the rest is near ends, bends, edges or other lines")
+        if seen.any() and (judged := float(ok[seen].mean())) < 0.5:
+            words.append(f"{judged:.0%} of it was judged: the rest is near ends, bends, edges or other lines")
     if ok.any() and abs(float(np.median(height[ok]))) > s.max_height_mm:
         words.append(f"lies {np.median(height[ok]):+.2f} mm off the scanned surface: it has changed; re-scan")
     return tuple(words)
