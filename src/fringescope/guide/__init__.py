@@ -2,27 +2,36 @@
 
 `tissue` makes a scan ready once; `guide` takes strokes to traces, each with what is hidden and how exact it is, and to
 the picture. The parts: `drape` (where is it on the tissue), `curves` and `fills` (shapes that are measured along it),
-`trace` (what does the projector see of it), `draw` (which mirrors), `find` (where did it land).
+`inside` (what does an outline enclose), `letters`, `trace` (what does the projector see of it), `draw` (which mirrors),
+`find` (where did it land).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from fringescope.errors import GuidanceError
 from fringescope.guide import curves, drape, fills
+from fringescope.guide import inside as within
 from fringescope.guide.drape import Samples, Source
-from fringescope.guide.draw import Canvas
+from fringescope.guide.draw import Canvas, linear
 from fringescope.guide.fills import Patch
 from fringescope.guide.find import Shots, landings
+from fringescope.guide.inside import Inside
+from fringescope.guide.letters import letters
 from fringescope.guide.tissue import Tissue, tissue
-from fringescope.guide.trace import guided, hidden_parts, mirror_units, trace, visible_runs
+from fringescope.guide.trace import guided, hidden_parts, mirror_units, trace, usual_sigma, visible_runs
 from fringescope.settings import GuideSettings
-from fringescope.types import Fill, Guidance, Guided, Guidelines, Hidden, HiddenPart, Stroke, StrokeKind
+from fringescope.types import Fill, Guidance, Guided, Guidelines, HiddenPart, Stroke, StrokeKind, Trace
 
 __all__ = [
     "Shots", "Tissue", "guide", "hidden_parts", "landings", "mirror_units", "place", "tissue", "visible_runs",
 ]  # fmt: skip
+
+DARKEST = 0.03  #: level of the brightest lamp, of what it can, below which nobody sees a line
+OVER = 0.05  #: of a stroke's picture that later ones may paint over without a word
 
 
 def guide(
@@ -39,6 +48,9 @@ def guide(
         made, patches = place(stroke, tissue, s, calibration_mm)
         canvas.stroke(made, patches, s, dashed)
         out.append(made)
+    for i, lost in enumerate(canvas.painted_over()):
+        if lost > OVER:
+            out[i] = replace(out[i], notes=(*out[i].notes, f"later strokes paint over {lost:.0%} of it"))
     return Guidance(canvas.image(), tuple(out), guidelines.scan, guidelines.rig)
 
 
@@ -47,35 +59,52 @@ def place(
 ) -> tuple[Guided, list[Patch]]:
     """One stroke on the tissue and on the projector's plane, and what of it is filled."""
     try:
+        _check_colour(stroke, s)
         return _place(stroke, tissue, s, calibration_mm)
     except GuidanceError as e:
         return Guided(stroke, refused=str(e)), []
 
 
+def _check_colour(stroke: Stroke, s: GuideSettings) -> None:
+    """Raises GuidanceError for a colour that nobody sees."""
+    level = float(linear(stroke.color).max())
+    name = "#{:02x}{:02x}{:02x}".format(*stroke.color)
+    if level < DARKEST:
+        raise GuidanceError(f"color {name} is too dark to be seen on the tissue; needed a brighter one")
+    if round(255 * level * s.brightness) < 1:
+        raise GuidanceError(f"color {name} is dark at a brightness of {s.brightness:g}; raise guide.brightness")
+
+
 def _place(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: float) -> tuple[Guided, list[Patch]]:
     if stroke.kind is StrokeKind.TEXT:
         return _text(stroke, tissue, s, calibration_mm)
-    lines = [curves.circle(stroke, tissue, s) if stroke.kind is StrokeKind.CIRCLE else drape.drape(stroke, tissue, s)]
-    notes = lines[0].notes
+    disc: curves.Disc | None = None
+    if stroke.kind is StrokeKind.CIRCLE:
+        line, disc = curves.circle(stroke, tissue, s)
+    else:
+        line = drape.drape(stroke, tissue, s)
+    lines, notes = [line], line.notes
     if stroke.kind is StrokeKind.ARROW:
-        lines += curves.head(lines[0], stroke, tissue, s)
+        lines += curves.head(line, stroke, tissue, s)
     elif stroke.kind is StrokeKind.OFFSETS:
-        lines += curves.offsets(lines[0], stroke, tissue)
-    if not any((line.source != Source.NOBODY).any() for line in lines):
-        raise GuidanceError(_nowhere(lines[0], stroke))
+        lines += curves.offsets(line, stroke, tissue)
+    filled = stroke.fill is Fill.SOLID and disc is not None and bool(disc.whole[0].any())
+    if not filled and not any((x.source != Source.NOBODY).any() for x in lines):
+        raise GuidanceError(_nowhere(line, stroke))
     patches: list[Patch] = []
     size: tuple[float, float] | None = None
     if stroke.closed or stroke.kind in (StrokeKind.REGION, StrokeKind.CIRCLE):
-        size, patch, more = _inside(lines[0], stroke, tissue, s)
+        t = trace(line, stroke, tissue, 0.0, s)
+        inside = _inside(t, disc, stroke, tissue, s)
+        size, more = _size(inside, line, t, tissue)
         notes += more
-        if stroke.fill is Fill.SOLID and patch is not None:
-            patches.append(patch)
-        elif stroke.fill is Fill.HATCH:
-            known = np.isfinite(lines[0].xyz).all(1)
-            lines += curves.hatch(lines[0].xyz[known], stroke, tissue, s)
-    traces = [trace(line, stroke, tissue, calibration_mm, s) for line in lines if len(line)]
-    made = guided(stroke, traces, notes, size)
-    return made, patches
+        if inside is not None and stroke.fill is Fill.SOLID:
+            patches.append(fills.lit(inside.share, inside.low, tissue.rig.projector, tissue.relief))
+        elif inside is not None and stroke.fill is Fill.HATCH:
+            known = np.isfinite(line.xyz).all(1)
+            lines += curves.hatch(line.xyz[known], inside, stroke, tissue, s)
+    traces = [trace(x, stroke, tissue, calibration_mm, s) for x in lines if len(x)]
+    return guided(stroke, traces, notes, size), patches
 
 
 def _nowhere(line: Samples, stroke: Stroke) -> str:
@@ -85,53 +114,59 @@ def _nowhere(line: Samples, stroke: Stroke) -> str:
 
 
 def _inside(
-    line: Samples, stroke: Stroke, tissue: Tissue, s: GuideSettings
-) -> tuple[tuple[float, float] | None, Patch | None, tuple[str, ...]]:
-    """Area of a closed stroke with its sigma, its filling, and notes."""
-    known = np.isfinite(line.xyz).all(1)
-    outline = line.xyz[known]
-    projector = tissue.rig.projector
-    t = trace(line, stroke, tissue, 0.0, s)
-    if stroke.pixels is not None and stroke.kind is not StrokeKind.CIRCLE:
-        assert stroke.camera is not None
-        units = fills.in_photograph(stroke.pixels, stroke.camera, tissue)
-        if units is None:
-            return None, None, ("nothing inside it was measured",)
-        share, low = units
-        patch: Patch | None = fills.device_patch(share, low, projector)
-    else:
-        ring = t.uv[np.isfinite(t.uv).all(1)]
-        if len(ring) < 3:
-            return None, None, ("nothing inside it was measured",)
-        w, h = projector.plane_size
-        low = np.clip(np.floor(ring.min(0)) - 1, 0, [w - 1, h - 1]).astype(int)
-        high = np.clip(np.ceil(ring.max(0)) + 1, 0, [w - 1, h - 1]).astype(int)
-        share = fills.inside([ring], low, (int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)))
-        patch = fills.polygons([ring], projector, tissue.relief)
-    sigma = float(np.nanmedian(t.sigma)) if len(t) else 0.0
-    size, error, missing = fills.area(share, low, tissue.relief, outline, sigma)
-    notes = (f"{missing:.0%} of its area was not measured and is not lit",) if missing > 0.005 else ()
-    return (size, error), patch, notes
+    t: Trace, disc: curves.Disc | None, stroke: Stroke, tissue: Tissue, s: GuideSettings
+) -> Inside | None:
+    """What a closed stroke encloses; None where nothing of that was measured."""
+    if disc is not None:
+        return within.of_ways(disc.ways, disc.whole, tissue.rig.projector)
+    if stroke.pixels is None:
+        return within.of_outline(t, tissue, s)
+    assert stroke.camera is not None
+    units = fills.in_photograph(stroke.pixels, stroke.camera, tissue)
+    return None if units is None else Inside(*units)
+
+
+def _size(
+    inside: Inside | None, line: Samples, t: Trace, tissue: Tissue
+) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
+    """Area of what is enclosed, with its sigma, and what is to be said of it."""
+    dark: tuple[str, ...] = ()
+    if inside is not None and inside.dark > 0.005:
+        dark = (f"its outline is not on what the projector lights: {inside.dark:.0%} of what it encloses stays dark",)
+    if inside is None or not inside.share.any():
+        return None, dark or ("nothing inside it was measured",)
+    outline = line.xyz[np.isfinite(line.xyz).all(1)]
+    size, error, missing = fills.area(inside.share, inside.low, tissue.relief, outline, usual_sigma(t))
+    unknown = (f"{missing:.0%} of its area was not measured and is not lit",) if missing > 0.005 else ()
+    return (size, error), (*dark, *unknown)
 
 
 def _text(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: float) -> tuple[Guided, list[Patch]]:
-    places, rings, ground = fills.letters(stroke, tissue, s)
-    if not ground.any():
-        raise GuidanceError("none of the text lies on the measured surface; move it")
-    patch = fills.polygons(rings, tissue.rig.projector, tissue.relief)
-    whole = [bool(g.all()) for g in np.split(ground, np.cumsum([len(r) for r in rings])[:-1])]
-    closed = [np.vstack([p, p[:1]]) for p in places]
-    around = [float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in closed]
-    hidden: tuple[HiddenPart, ...] = ()
-    if not all(whole):
-        off = np.concatenate(rings)[~ground]
-        dark = sum(a for a, w in zip(around, whole, strict=True) if not w)
-        hidden = (HiddenPart(off[np.isfinite(off).all(1)], Hidden.HOLE, dark),)
-    notes = () if ground.all() else (f"{1 - ground.mean():.0%} of the text lies beside the measured surface",)
-    made = Guided(
-        stroke, hidden=hidden, notes=notes, length_mm=sum(around),
-        segments=tuple(np.vstack([r, r[:1]]) for r, w in zip(rings, whole, strict=True) if w),
-        lands=tuple(p for p, w in zip(closed, whole, strict=True) if w),
+    made = letters(stroke, tissue, s)
+    shown, dark = [x for x in made if x.why is None], [x for x in made if x.why is not None]
+    if not shown:
+        raise GuidanceError("no letter of it lies wholly on visible surface; move it, or write smaller")
+    notes: tuple[str, ...] = ()
+    if dark:
+        names = [c for c in stroke.text if not c.isspace()]
+        which = ", ".join(repr(n) for n, x in zip(names, made, strict=True) if x.why) if len(names) == len(made) else ""
+        told = f"{len(dark)} of {len(made)} letters are not wholly on visible surface and are not drawn"
+        notes = (f"{told}: {which}" if which else told,)
+    hidden = []
+    for x in dark:
+        assert x.why is not None
+        around = np.concatenate(x.rings)
+        hidden.append(HiddenPart(around[np.isfinite(around).all(1)], x.why, x.length_mm))
+    patches = []
+    for x in shown:
+        low, size = within.window(np.concatenate(x.rings), tissue.rig.projector)
+        patches.append(fills.lit(fills.inside(x.rings, low, size), low, tissue.rig.projector, tissue.relief))
+    return Guided(
+        stroke,
+        segments=tuple(r for x in shown for r in x.rings),
+        lands=tuple(p for x in shown for p in x.lands),
+        hidden=tuple(hidden),
+        length_mm=sum(x.length_mm for x in made),
         expected_error_um=1e3 * calibration_mm if calibration_mm else None,
-    )  # fmt: skip
-    return made, [] if patch is None else [patch]
+        notes=notes,
+    ), patches

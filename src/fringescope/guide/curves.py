@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fringescope import geometry
 from fringescope.errors import GuidanceError
-from fringescope.guide.drape import Samples, Source, on_surface, places
+from fringescope.guide.drape import DEEP_MM, Samples, Source, bridged, on_surface, places
+from fringescope.guide.inside import Inside
 from fringescope.guide.tissue import Tissue
-from fringescope.guide.trace import direction, smoothed
+from fringescope.guide.trace import direction, runs, smoothed
 from fringescope.settings import GuideSettings
 from fringescope.types import F64, Bool, Side, Stroke
 from fringescope.types.guidance import WIDTH_MM
 
-CIRCLE = 360  #: samples of a circle at most
+CIRCLE = 2000  #: samples of a circle at most
+CRUMB_MM = 0.5  #: shorter pieces of a circle are not drawn
+TURN_BACK = 2  #: samples to each side over which a rim must go forward
 HEAD_WIDTHS = 6.0  #: length of an arrow's head that asks for none, in widths of its line
 HEAD_TURN = math.radians(150)  #: from where the arrow points to where the wings of its head go
 
@@ -34,8 +38,21 @@ def frame_at(point: F64, tissue: Tissue) -> tuple[F64, F64, F64]:
     return right, np.cross(right, n) * np.sign(np.cross(right, n) @ p.pose.R[1]), n
 
 
-def circle(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> Samples:
-    """All that lies `radius_mm` from the centre, along the surface; or as far as the second point does."""
+@dataclass(frozen=True, eq=False)
+class Disc:
+    """What is walked over from a circle's centre: places (k + 1, n, 3) on the ways to its rim, and whether they (k + 1,
+    n) are on the surface and continue those of the way beside.
+    """
+
+    ways: F64
+    whole: Bool
+
+
+def circle(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> tuple[Samples, Disc]:
+    """All that lies `radius_mm` from the centre, along the surface; or as far as the second point does.
+
+    The rim is broken where the surface jumps or ends on the way there, and where it can be reached by a shorter way.
+    """
     at = places(stroke, stroke.points[:2], tissue, s)
     if not np.isfinite(at[0]).all():
         raise GuidanceError("the centre of the circle is not on the measured surface; move it")
@@ -46,12 +63,37 @@ def circle(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> Samples:
         radius = float(np.linalg.norm(at[1] - at[0]))
         if radius < 0.05:
             raise GuidanceError("the circle's second point lies on its centre; needed a radius of 0.05 mm or more")
-    right, down, _ = frame_at(at[0], tissue)
+    right, down, normal = frame_at(at[0], tissue)
     n = int(np.clip(math.ceil(2 * math.pi * radius / s.sample_mm), 24, CIRCLE))
     a = np.linspace(0, 2 * math.pi, n + 1)
     towards = np.cos(a)[:, None] * right + np.sin(a)[:, None] * down
-    rim, ground = tissue.relief.walk(np.repeat(at[:1], n + 1, 0), towards, np.full(n + 1, radius))
-    return on_surface(rim, ground, notes=(f"radius {radius:.2f} mm",))
+    ways, d, walks, ground = tissue.relief.paths(np.repeat(at[:1], n + 1, 0), towards, radius, 2 * s.gap_mm)
+    far = max(s.jump_mm, 8 * 2 * math.pi * radius / n)
+    beside = np.linalg.norm(np.diff(ways, axis=1), axis=2) <= far
+    there = ground[-1] & ~_turned_back(ways[-1], d, float(np.sign(np.cross(right, normal) @ down)), tissue)
+    rim = np.where(there[:, None], ways[-1], np.nan)
+    jump = ~beside[-1] & there[1:] & there[:-1]
+    piece = np.concatenate([[0], np.cumsum(jump)]).astype(np.int32)
+    length = np.concatenate([[0.0], np.linalg.norm(np.diff(rim, axis=0), axis=1)])
+    for first, last in runs(np.where(there, piece, -1)):  # crumbs
+        if there[first] and np.nansum(length[first + 1 : last]) < min(CRUMB_MM, 0.5 * radius):
+            there[first:last] = False
+    rim, _ = bridged(np.where(there[:, None], rim, np.nan))
+    notes = [f"radius {radius:.2f} mm"]
+    if (lost := float((~there[:-1]).mean())) >= 0.005:
+        notes.append(f"{lost:.0%} of it is not reached along the surface, which jumps or ends before: not drawn there")
+    if jump.any():
+        notes.append(f"the surface jumps under it: it is broken in {int(jump.sum())} places")
+    whole = np.logical_and.accumulate(walks[:, 1:] & walks[:, :-1] & beside, axis=0)
+    return on_surface(rim, there, piece, tuple(notes)), Disc(ways, whole)
+
+
+def _turned_back(rim: F64, d: F64, sense: float, tissue: Tissue) -> Bool:
+    """Which places of a rim (n, 3), reached in directions `d`, run against the turn: other ways there are shorter."""
+    n = tissue.relief.of(tissue.relief.normal, geometry.project(tissue.rig.projector, rim))
+    ring = np.concatenate([rim[-1 - TURN_BACK : -1], rim, rim[1 : 1 + TURN_BACK]])
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((ring[2 * TURN_BACK :] - ring[: -2 * TURN_BACK]) * np.cross(d, n)).sum(1) * sense < 0)
 
 
 def head(line: Samples, stroke: Stroke, tissue: Tissue, s: GuideSettings) -> list[Samples]:
@@ -128,8 +170,12 @@ def _parts(piece: Any, at: Any, most: float) -> Any:
     return np.concatenate([[0], np.cumsum((np.diff(piece) != 0) | (np.diff(at) > most))]).astype(np.int32)[: len(piece)]
 
 
-def hatch(outline: F64, stroke: Stroke, tissue: Tissue, s: GuideSettings) -> list[Samples]:
-    """Lines every `spacing_mm` across a region, on its mean plane, dropped onto the surface; `outline` (n, 3) mm."""
+def hatch(outline: F64, inside: Inside, stroke: Stroke, tissue: Tissue, s: GuideSettings) -> list[Samples]:
+    """Lines every `spacing_mm` across a region, on its mean plane, dropped onto the surface; `outline` (n, 3) mm.
+
+    What they would meet that does not belong to the region is left out, or hidden, where it lies above it.
+    """
+    projector = tissue.rig.projector
     centre = outline.mean(0)
     _, _, axes = np.linalg.svd(outline - centre, full_matrices=False)
     right, _, _ = frame_at(centre, tissue)
@@ -145,9 +191,21 @@ def hatch(outline: F64, stroke: Stroke, tissue: Tissue, s: GuideSettings) -> lis
             n = max(3, math.ceil((b - a) / s.sample_mm) + 1)
             line = np.stack([np.linspace(a, b, n), np.full(n, i * stroke.spacing_mm)], 1) @ np.array([[c, d], [-d, c]])
             spot = centre + line[:, :1] * e1 + line[:, 1:] * e2
-            ground = tissue.relief.at(geometry.project(tissue.rig.projector, spot))
+            uv = geometry.project(projector, spot)
+            ground = tissue.relief.at(uv)
             there: Bool = np.asarray(np.isfinite(ground).all(1))
-            out.append(on_surface(np.where(there[:, None], ground, spot), there))
+            spot = np.where(there[:, None], ground, spot)
+            behind = inside.behind(uv)
+            deep = there & (behind > DEEP_MM)  # something else is before it
+            eye = geometry.centre(projector.pose)
+            ray = spot[deep] - eye
+            spot[deep] += ray * (behind[deep] / (ray @ projector.pose.R[2]))[:, None]
+            keep = np.flatnonzero(~there | deep | inside.holds(uv))
+            if len(keep) < 2:
+                continue
+            made = on_surface(spot[keep], there[keep], np.cumsum(np.diff(keep, prepend=keep[0]) > 1).astype(np.int32))
+            made.source[deep[keep]] = Source.ASKED
+            out.append(made)
     return out
 
 

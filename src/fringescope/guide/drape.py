@@ -66,10 +66,13 @@ def places(stroke: Stroke, points: F64, tissue: Tissue, s: GuideSettings) -> F64
     """Single points of a stroke on the tissue (n, 3), NaN where there is none."""
     if stroke.pixels is not None:
         assert stroke.camera is not None
-        out = _seen(points, stroke.camera, tissue, s)
+        out = seen(points, stroke.camera, tissue, s)
         return np.where((out.source == Source.NOBODY)[:, None], np.nan, out.xyz)
     uv = geometry.project(tissue.rig.projector, points)
-    return np.where((_gap(points, uv, tissue)[0] > -s.off_surface_mm)[:, None], points, np.nan)
+    gap, slack = _gap(points, uv, tissue)
+    with np.errstate(invalid="ignore"):
+        there = np.abs(gap) <= s.off_surface_mm + slack
+    return np.where(there[:, None], points, np.nan)
 
 
 # ------------------------------------------------------------------------------------------------------- photographs
@@ -89,8 +92,8 @@ def from_photograph(pixels: F64, camera: str, closed: bool, tissue: Tissue, s: G
     H, W = tissue.grids[number].reasons.shape
     path, beside = clipped(path, np.array([-3.0, -3.0]), np.array([W + 2.0, H + 2.0]))
     dense, _ = resampled(path, max(0.5, s.sample_mm / footprint), s.max_samples, beside, s.jump_mm / footprint)
-    out = _seen(dense, camera, tissue, s)
-    xyz, guessed = _bridged(out.xyz)
+    out = seen(dense, camera, tissue, s)
+    xyz, guessed = bridged(out.xyz)
     piece, jumps = _pieces(xyz, guessed, dense, footprint, s)
     off = ~((dense >= -0.5).all(1) & (dense[:, 0] < W - 0.5) & (dense[:, 1] < H - 0.5))
     notes = []
@@ -104,7 +107,7 @@ def from_photograph(pixels: F64, camera: str, closed: bool, tissue: Tissue, s: G
     return Samples(xyz, out.source, out.ray, out.sigma, piece, tuple(notes))
 
 
-def _seen(pixels: F64, camera: str, tissue: Tissue, s: GuideSettings) -> Samples:
+def seen(pixels: F64, camera: str, tissue: Tissue, s: GuideSettings) -> Samples:
     """Pixels (n, 2) of a camera on the tissue: by its own points, else by what others measured along the ray."""
     number = tissue.number(camera)
     grid, footprint = tissue.grids[number], tissue.footprints[number]
@@ -157,7 +160,7 @@ def _along_rays(origin: F64, rays: F64, tissue: Tissue, number: int) -> F64:
     return out
 
 
-def _bridged(xyz: F64) -> tuple[F64, Bool]:
+def bridged(xyz: F64) -> tuple[F64, Bool]:
     """Places with holes guessed on straight lines between what lies around them, and which are guesses."""
     known = np.asarray(np.isfinite(xyz).all(1))
     if known.all() or not known.any():

@@ -13,6 +13,7 @@ from fringescope.kernels import guiding as k
 from fringescope.settings import GuideSettings
 from fringescope.types import F32, F64, U8, Guided, Layout, Projector, Trace
 
+PAINTED = 0.25  #: share of a pixel that makes it a stroke's
 STRIPE = 16  #: rows of the device in a stripe of what is filled and in doubt
 
 
@@ -29,9 +30,12 @@ class Canvas:
         self._projector = projector
         self._light = np.zeros((projector.height, projector.width, 3), np.float32)
         self._touched = (slice(projector.height, 0), slice(projector.width, 0))
+        self._owner = np.zeros((projector.height, projector.width), np.int32)  # 1 + the number of a stroke
+        self._painted = [0]  # by nobody, and by each stroke
 
     def stroke(self, g: Guided, patches: Sequence[Patch], s: GuideSettings, dashed: bool) -> None:
         """Paints what of a stroke is visible."""
+        self._painted.append(0)
         color = linear(g.stroke.color).astype(np.float32) * np.float32(s.brightness)
         for patch in patches:
             share = patch.share
@@ -65,11 +69,20 @@ class Canvas:
         part = self._light[top : top + share.shape[0], left : left + share.shape[1]]
         share = share[: part.shape[0], : part.shape[1]]
         k.paint(share, color, part)
+        owner, mine = self._owner[top : top + part.shape[0], left : left + part.shape[1]], len(self._painted) - 1
+        new = (share >= PAINTED) & (owner != mine)
+        self._painted[mine] += int(np.count_nonzero(new))
+        owner[new] = mine
         rows, columns = part.shape[:2]
         self._touched = (
             slice(min(self._touched[0].start, top), max(self._touched[0].stop, top + rows)),
             slice(min(self._touched[1].start, left), max(self._touched[1].stop, left + columns)),
         )
+
+    def painted_over(self) -> list[float]:
+        """The share of each stroke's pixels that later ones have taken, 0..1."""
+        left = np.bincount(self._owner[self._touched].ravel(), minlength=len(self._painted))
+        return [1 - float(left[i]) / n if n else 0.0 for i, n in enumerate(self._painted) if i]
 
     def image(self) -> U8:
         """The picture (height, width, 3) RGB."""

@@ -11,15 +11,10 @@ import cv2
 import numpy as np
 
 from fringescope import geometry
-from fringescope.errors import GuidanceError
-from fringescope.guide.curves import frame_at
-from fringescope.guide.drape import places
 from fringescope.guide.relief import Relief
 from fringescope.guide.tissue import Tissue
-from fringescope.settings import GuideSettings
-from fringescope.types import F32, F64, Bool, Layout, Projector, Stroke
+from fringescope.types import F32, F64, Layout, Projector
 
-FONT = "DejaVu Sans"  #: comes with matplotlib: the same letters everywhere
 FINE = 4  #: samples along each side of a unit
 BITS = 4  #: fractions of a pixel in OpenCV's coordinates
 
@@ -33,30 +28,26 @@ class Patch:
     share: F32
 
 
-def inside(rings: Sequence[F64], low: Any, size: tuple[int, int]) -> F32:
-    """Share of each unit that lies inside polygons (even-odd), from unit `low` (u, v) on: `size` = (rows, columns)."""
+def inside(rings: Sequence[F64], low: Any, size: tuple[int, int], union: bool = False) -> F32:
+    """Share of each unit that lies inside polygons, from unit `low` (u, v) on: `size` = (rows, columns).
+
+    By the even-odd rule; with `union` what lies in any of them.
+    """
     fine = np.zeros((size[0] * FINE, size[1] * FINE), np.uint8)
     scaled = [
         np.round(((ring - low + 0.5) * FINE - 0.5) * (1 << BITS)).clip(-(2**30), 2**30).astype(np.int32)
         for ring in rings
     ]
-    cv2.fillPoly(fine, scaled, 1, cv2.LINE_8, BITS)
+    for some in ([x] for x in scaled) if union else (scaled,):
+        cv2.fillPoly(fine, some, 1, cv2.LINE_8, BITS)
     return np.asarray(cv2.resize(fine.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
 
-def polygons(rings: Sequence[F64], projector: Projector, relief: Relief) -> Patch | None:
-    """Polygons on the projector's plane, where there is a surface to receive them, as shares of the device's pixels."""
-    every = np.concatenate([r for r in rings if len(r)]) if any(len(r) for r in rings) else np.zeros((0, 2))
-    every = every[np.isfinite(every).all(1)]
-    if not len(every):
-        return None
-    w, h = projector.plane_size
-    low = np.clip(np.floor(every.min(0)) - 1, 0, [w - 1, h - 1]).astype(int)
-    high = np.clip(np.ceil(every.max(0)) + 1, 0, [w - 1, h - 1]).astype(int)
-    size = (int(high[1] - low[1] + 1), int(high[0] - low[0] + 1))
-    share = inside([r[np.isfinite(r).all(1)] for r in rings], low, size)
-    share *= np.isfinite(relief.depth[low[1] : high[1] + 1, low[0] : high[0] + 1])
-    return device_patch(share, low, projector)
+def lit(share: F32, low: Any, projector: Projector, relief: Relief) -> Patch:
+    """Shares of units of the plane, where there is a surface to receive them, as shares of the device's pixels."""
+    rows, columns = share.shape
+    there = np.isfinite(relief.depth[low[1] : low[1] + rows, low[0] : low[0] + columns])
+    return device_patch(share * there, low, projector)
 
 
 def device_patch(share: F32, low: Any, projector: Projector) -> Patch:
@@ -133,48 +124,3 @@ def area(share: F32, low: Any, relief: Relief, outline: F64, sigma_mm: float) ->
     around = float(np.nansum(np.linalg.norm(np.diff(np.vstack([outline, outline[:1]]), axis=0), axis=1)))
     filled = total / max(1 - missing, 1e-3)
     return filled, math.hypot(sigma_mm * math.sqrt(max(around, 0.5) * 0.5), 0.5 * (filled - total)), missing
-
-
-# --------------------------------------------------------------------------------------------------------------- text
-
-
-def _without_a_letter(text: str) -> str:
-    """What of a text the font cannot draw."""
-    from matplotlib.font_manager import FontProperties, findfont, get_font
-
-    font = get_font(findfont(FontProperties(family=FONT)))
-    return "".join(dict.fromkeys(c for c in text if not c.isspace() and font.get_char_index(ord(c)) == 0))
-
-
-def letters(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> tuple[list[F64], list[F64], Bool]:
-    """The outlines of a text: on the tissue, each (n, 3) mm, on the projector's plane, each (n, 2), and which of their
-    points are on the surface.
-
-    It starts at the first point and runs towards the second, or to the projector's right; `size_mm` is the height of
-    its lines. Each letter lies on the surface: along the line of writing first, then up.
-    """
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath  # only who writes needs it
-
-    if missing := _without_a_letter(stroke.text):
-        raise GuidanceError(f"text {stroke.text!a}: the font has no letter for {missing!a}; write it otherwise")
-    path = TextPath((0, 0), stroke.text.replace("$", r"\$"), stroke.size_mm, FontProperties(family=FONT))
-    rings = [r for r in map(np.asarray, path.to_polygons(closed_only=False)) if len(r) > 2]
-    if not rings:
-        raise GuidanceError(f"text {stroke.text!r} has nothing to draw")
-    at = places(stroke, stroke.points[:2], tissue, s)
-    if not np.isfinite(at[0]).all():
-        raise GuidanceError("the text starts beside the measured surface; move it")
-    right, down, n = frame_at(at[0], tissue)
-    along = right
-    if len(at) > 1 and np.isfinite(at[1]).all() and np.linalg.norm(at[1] - at[0]) > 0.1:
-        along = (at[1] - at[0]) - ((at[1] - at[0]) @ n) * n
-        along /= np.linalg.norm(along)
-    up = -down if along is right else np.cross(n, along)
-    xy = np.concatenate(rings)
-    m = len(xy)
-    foot, ground = tissue.relief.walk(np.repeat(at[:1], m, 0), np.sign(xy[:, :1] + 1e-12) * along, np.abs(xy[:, 0]))
-    p, above = tissue.relief.walk(foot, np.sign(xy[:, 1:] + 1e-12) * up, np.abs(xy[:, 1]))
-    uv = geometry.project(tissue.rig.projector, p)
-    cuts = np.cumsum([len(r) for r in rings])[:-1]
-    return np.split(p, cuts), np.split(uv, cuts), ground & above

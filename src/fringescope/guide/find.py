@@ -7,7 +7,6 @@ cameras find is triangulated in the plane across the line, with the scanned surf
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,13 +15,22 @@ from typing import Any
 import numpy as np
 
 from fringescope import geometry
+from fringescope.guide import stations
+from fringescope.guide.stations import Stations
 from fringescope.guide.tissue import Tissue
-from fringescope.guide.trace import visible_runs
 from fringescope.settings import LoopSettings
-from fringescope.types import F32, F64, AnyArray, Bool, Camera, Fill, Guidance, Guided, Landing, PixelFormat
-from fringescope.types.guidance import WIDTH_MM
+from fringescope.types import F32, F64, AnyArray, Bool, Camera, Fill, Grid, Guidance, Landing, PixelFormat, Projector
 
 REACHES = 61  #: places across a line at which its centre is tried, before it is refined
+LEAST = 2  #: pixels of a line's profile, and of the ground to each side of it, must be seen
+SIDE_SHARE = 0.25  #: and this share of those that there are
+FEW = 16  #: pixels of each kind of a colour mosaic around a station: with fewer they are taken together
+KIND_SHARE = 0.3  #: the same, of each kind of pixel of a colour mosaic, of what the best of them sees
+SIZES = (10, 20, 40)  #: pixels around stations that are looked at, by which they are taken together
+BLUR_PIXELS = 0.6  #: softness of a camera's pictures (standard deviation)
+SOFTER = (0.7, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0)  #: than expected that lines may be
+DARK = 0.03  #: light, as a share of that of all mirrors, that is none
+SLOPE_LEAST = 0.5  #: pixels that a line must move for a mm across
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,140 +44,77 @@ class Shots:
     guided: AnyArray
 
 
-@dataclass(frozen=True, eq=False)
-class _Stations:
-    """Places of a stroke at which it is looked for: on the tissue, along it, across it, and half its width, mm.
-
-    `before` and `after` lie on the line, at the ends of the piece that a station looks at.
-    """
-
-    place: F64
-    before: F64
-    after: F64
-    along: F64
-    across: F64
-    normal: F64
-    half: F64
-
-
 def landings(
     guidance: Guidance, shots: Sequence[Shots], tissue: Tissue, s: LoopSettings
 ) -> tuple[Landing, ...]:
     """The landing of every stroke that is shown, in the order of the strokes.
 
-    Text and what is filled are not looked for, and no line where another one crosses or runs beside it.
+    Text and what is filled are not looked for, and no line where others cross or run beside it, or where it ends.
     """
     out = []
-    everything = [_points(g) for g in guidance.strokes]
+    every = stations.lights(guidance, tissue)
     for i, g in enumerate(guidance.strokes):
         if g.refused is not None or not any(len(t) for t in g.traces) or g.stroke.fill is Fill.SOLID:
             continue
-        others = np.concatenate([np.zeros((0, 4)), *(p for j, p in enumerate(everything) if j != i)])
-        stations = _alone(_stations(g, s), others, s)
-        out.append(_landing(g.stroke.id, stations, shots, tissue, s))
+        out.append(_landing(g.stroke.id, stations.of_stroke(g, i, every, tissue, s), shots, tissue, s))
     return tuple(out)
-
-
-def _points(g: Guided) -> F64:
-    """Places on the tissue of a stroke that are lit, with half its width there (n, 4), mm."""
-    rows = [
-        np.column_stack([t.xyz[a:b], _half_mm(g, t.half[a:b])]) for t in g.traces for a, b in visible_runs(t)
-    ]
-    return np.concatenate([np.zeros((0, 4)), *rows])
-
-
-def _half_mm(g: Guided, half: F64) -> F64:
-    width = g.stroke.width_mm
-    if width is None and g.stroke.width_px is None:
-        width = WIDTH_MM
-    return np.full(len(half), 0.5 * width) if width is not None else np.full(len(half), np.nan)
-
-
-def _stations(g: Guided, s: LoopSettings) -> _Stations:
-    """Stations every `station_mm` along the visible pieces, clear of their ends."""
-    parts: list[tuple[F64, ...]] = []
-    for t in g.traces:
-        for a, b in visible_runs(t):
-            p = t.xyz[a:b]
-            gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
-            clear = s.along_mm + 0.3
-            if gone[-1] <= 2 * clear + 0.1:
-                continue
-            n = max(1, int((gone[-1] - 2 * clear) / s.station_mm))
-            at = np.linspace(clear, gone[-1] - clear, n)
-            i = np.clip(np.searchsorted(gone, at), 1, len(p) - 1)
-            reach = s.along_mm
-            before, place, after = (
-                np.stack([np.interp(at + d, gone, p[:, k]) for k in range(3)], 1) for d in (-reach, 0.0, reach)
-            )
-            along = after - before
-            along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-            normal = t.normal[a:b][i]
-            across = np.cross(normal, along)
-            across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-            parts.append((place, before, after, along, across, np.cross(along, across), _half_mm(g, t.half[a:b])[i]))
-    if not parts:
-        return _Stations(*(np.zeros((0, 3)),) * 6, np.zeros(0))
-    return _Stations(*(np.concatenate(c) for c in zip(*parts, strict=True)))
-
-
-def _alone(st: _Stations, others: F64, s: LoopSettings) -> _Stations:
-    """The stations that no other line comes near."""
-    if not len(others) or not len(st.place):
-        return st
-    from scipy.spatial import cKDTree
-
-    reach = np.nan_to_num(others[:, 3], nan=0.3).max() + np.nan_to_num(st.half, nan=0.3) + s.search_mm
-    away = cKDTree(others[:, :3]).query(st.place)[0] > reach
-    return _Stations(*(getattr(st, f.name)[away] for f in dataclasses.fields(st)))
 
 
 # ----------------------------------------------------------------------------------------------------- one stroke
 
 
-def _landing(name: str, st: _Stations, shots: Sequence[Shots], tissue: Tissue, s: LoopSettings) -> Landing:
+def _landing(name: str, st: Stations, shots: Sequence[Shots], tissue: Tissue, s: LoopSettings) -> Landing:
     n = len(st.place)
     offset, sigma = np.full((len(shots), n), np.nan), np.full((len(shots), n), np.nan)
     slopes = np.zeros((len(shots), n, 2))
     seen = np.zeros((len(shots), n), bool)
     views = []
+    fit_for = st.reach > 0
     for k, shot in enumerate(shots):
-        number = tissue.number(shot.camera)
-        views.append(tissue.grids[number].view)
-        camera = tissue.rig.cameras[views[-1]]
-        seen[k] = _sees(tissue, number, st.place)
-        lines = _in_picture(camera, st)
-        slopes[k] = lines.slopes
-        look = np.flatnonzero(seen[k])
+        grid = tissue.grids[tissue.number(shot.camera)]
+        views.append(grid.view)
+        camera = tissue.rig.cameras[grid.view]
+        seen[k] = _sees(tissue, tissue.number(shot.camera), st.place)
+        at, side, slopes[k], pace = _in_picture(camera, st)
+        look = np.flatnonzero(seen[k] & fit_for & (np.abs(slopes[k, :, 0]) > SLOPE_LEAST))
         if look.size:
-            offset[k, look], sigma[k, look] = _find(shot, lines.of(look), st.half[look], s)
+            some = st.of(look)
+            mm, error = _find(
+                shot, grid, some, at[look], side[look], slopes[k, look, 0], pace[look], tissue.rig.projector, s
+            )
+            offset[k, look], sigma[k, look] = mm * slopes[k, look, 0], error * np.abs(slopes[k, look, 0])
     found, height = _triangulate(offset, sigma, slopes, s)
     ok = np.isfinite(found)
     told = 1e3 * np.abs(found[ok])
-    words = []
-    expected = seen.any(0)
-    share = float(ok[expected].mean()) if expected.any() else 0.0
-    if n == 0:
-        words.append("too short, or too close to other lines, to be looked for")
-    elif share < 0.5:
-        words.append(f"found at {share:.0%} of the places where it should be seen")
-    if ok.any() and abs(float(np.median(height[ok]))) > s.max_height_mm:
-        words.append(f"lies {np.median(height[ok]):+.2f} mm off the scanned surface: it has changed; re-scan")
     kk, jj = np.nonzero(np.isfinite(offset) & ok[None])
-    mine = offset[kk, jj]
-    pace_mm = slopes[kk, jj, 0]
     return Landing(
         name,
-        st.place[jj] + st.across[jj] * (mine / np.where(np.abs(pace_mm) > 1e-6, pace_mm, np.nan))[:, None],
+        st.place[jj] + st.across[jj] * (offset[kk, jj] / slopes[kk, jj, 0])[:, None],
         st.place[jj],
         1e3 * found[jj],
         np.array([views[k] for k in kk], np.int32),
         float(np.median(told)) if len(told) else None,
         float(np.percentile(told, 95)) if len(told) else None,
         float(told.max()) if len(told) else None,
-        share,
-        tuple(words),
+        float(ok[seen.any(0)].mean()) if seen.any() else 0.0,
+        _words(ok, np.asarray(seen.any(0)), fit_for, height, s),
     )
+
+
+def _words(ok: Bool, seen: Bool, fit_for: Bool, height: F64, s: LoopSettings) -> tuple[str, ...]:
+    """What is to be said of a landing: `ok` where it was found, of the places that are `seen` and can be judged."""
+    words = []
+    expected = seen & fit_for
+    if not fit_for.any():
+        words.append("too short, or too close to other lines, to be looked for")
+    else:
+        if (share := float(ok[expected].mean()) if expected.any() else 0.0) < 0.5:
+            words.append(f"found at {share:.0%} of the places where it should be seen")
+        if seen.any() and (judged := float(ok[seen].mean())) < 0.5:
+            words.append(f"{judged:.0%} of it was judged: the rest is near ends, bends, edges or other lines")
+    if ok.any() and abs(float(np.median(height[ok]))) > s.max_height_mm:
+        words.append(f"lies {np.median(height[ok]):+.2f} mm off the scanned surface: it has changed; re-scan")
+    return tuple(words)
 
 
 def _sees(tissue: Tissue, number: int, place: F64) -> Bool:
@@ -184,74 +129,112 @@ def _sees(tissue: Tissue, number: int, place: F64) -> Bool:
     return np.asarray(ok & (g.reasons[r, c] == 0) & (near < 0.2 + 1.5 * tissue.footprints[number]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """Stations in a picture, pixels: place (n, 2), unit direction across the line (n, 2), how far it moves across for a
-    mm across and a mm up (n, 2), pixels per mm along it (n,), and its bend: how far across after a pixel along (n,).
+def _in_picture(camera: Camera, st: Stations) -> tuple[F64, F64, F64, F64]:
+    """Stations in a picture: their pixels (n, 2), the unit direction across the line (n, 2), how far the line moves so
+    for a mm across and a mm up (n, 2), pixels, and pixels per mm along it (n,).
     """
-
-    at: F64
-    side: F64
-    slopes: F64
-    pace: F64
-    bend: F64
-
-    def of(self, look: Any) -> _Lines:
-        """Some of them."""
-        return _Lines(*(getattr(self, f.name)[look] for f in dataclasses.fields(self)))
-
-
-def _in_picture(camera: Camera, st: _Stations) -> _Lines:
     h = 0.05
 
     def moved(d: F64) -> F64:
         a = geometry.project(camera, st.place + h * d) - geometry.project(camera, st.place - h * d)
         return np.asarray(a / (2 * h))
 
-    at = geometry.project(camera, st.place)
     along, across, up = moved(st.along), moved(st.across), moved(st.normal)
     pace = np.linalg.norm(along, axis=1)
     line = along / np.maximum(pace, 1e-9)[:, None]
     side = np.stack([-line[:, 1], line[:, 0]], 1)
     side *= np.sign((side * across).sum(1))[:, None]
-    ends = [geometry.project(camera, e) - at for e in (st.before, st.after)]
-    reach2 = 0.5 * sum((e**2).sum(1) for e in ends)
-    bend = (0.5 * (ends[0] + ends[1]) * side).sum(1) / np.maximum(reach2, 1e-9)
-    return _Lines(at, side, np.stack([(side * across).sum(1), (side * up).sum(1)], 1), pace, bend)
+    return geometry.project(camera, st.place), side, np.stack([(side * across).sum(1), (side * up).sum(1)], 1), pace
 
 
-def _find(shot: Shots, lines: _Lines, half: F64, s: LoopSettings) -> tuple[F64, F64]:
-    """How far across the line (n,), pixels, from where it should be its light is centred, and the error of that.
+def _find(
+    shot: Shots, grid: Grid, st: Stations, at: F64, side: F64, slope: F64, pace: F64, projector: Projector,
+    s: LoopSettings,
+) -> tuple[F64, F64]:
+    """How far across the line (n,), mm, from where it should be its light is centred, and the error of that.
 
-    NaN where it is not found: too little light, saturated, or a profile that is not that of a line.
+    Each pixel tells of the place that the camera measured there: how far that is from the line is taken on the
+    projector's plane, where a line keeps its width whatever it lies on. NaN where the line is not found: too little
+    light, saturated, one side of it not seen, or a profile that is not that of a line.
     """
-    at, side, wide = lines.at, lines.side, np.abs(lines.slopes[:, 0])
-    per_mm = float(np.median(lines.pace))
-    reach_across = float(np.nanmax(np.nan_to_num(half, nan=0.3)) + s.search_mm) * per_mm
-    reach_along = max(s.along_mm * per_mm, 1.0)
-    R = math.ceil(math.hypot(reach_across, reach_along)) + 1
-    stride = max(1, int(2 * R / 40))  # many pixels do not make it better
-    steps = np.arange(-R, R + 1, stride)
+    size = np.hypot((st.half / st.per_mm + s.search_mm) * np.abs(slope), st.reach * pace)
+    found, error = np.full(len(at), np.nan), np.full(len(at), np.nan)
+    seen: list[tuple[Any, _Profiles]] = []
+    for low, high in zip((0, *SIZES), (*SIZES, np.inf), strict=True):
+        if (some := np.flatnonzero((size > low) & (size <= high))).size:
+            R = math.ceil(float(size[some].max())) + 1
+            where = at[some], side[some], slope[some], pace[some]
+            seen.append((some, _profiles(shot, grid, st.of(some), *where, R, projector)))
+    levels = _levels([p for _, p in seen])
+    for some, p in seen:
+        width = np.hypot(s.blur_mm, BLUR_PIXELS / np.abs(slope[some]))
+        found[some], error[some] = _fit(p, levels, st.search[some], width, np.abs(slope[some]), s)
+    return found, error
+
+
+@dataclass(frozen=True, eq=False)
+class _Profiles:
+    """Pixels around n stations: how far across the line they lie (n, m), mm, their light as a share of that of all
+    mirrors, their weights (0: not to be used); the columns of each kind of pixel of a colour mosaic; half the line's
+    width (n,), mm, and half its curvature, 1/mm; how many pixels there are to its left, on it and to its right (n, 3).
+    """
+
+    x: F64
+    y: F64
+    w: F64
+    kinds: list[Any]
+    half: F64
+    bow: F64
+    room: F64
+
+
+def _profiles(
+    shot: Shots, grid: Grid, st: Stations, at: F64, side: F64, slope: F64, pace: F64, R: int, projector: Projector
+) -> _Profiles:
+    """The profiles of lines in a picture, within R pixels of the stations."""
+    stride = max(1, int(2 * R / 40)) | 1  # many pixels do not make it better; odd, to meet all kinds of them
+    steps = np.arange(-stride * math.ceil(R / stride), R + 2, stride)
     dv, du = (a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
-    base = np.floor(at + 0.5).astype(np.intp)
+    base = 2 * np.floor(0.5 * at + 0.25).astype(np.intp)  # even: the mosaic is the same around each
     H, W = shot.dark.shape[:2]
     c, r = base[:, :1] + du, base[:, 1:] + dv
     inside = (c >= 0) & (c < W) & (r >= 0) & (r < H)
     cc, rr = np.where(inside, c, 0), np.where(inside, r, 0)
-    px, py = cc - at[:, :1], rr - at[:, 1:]
-    x = px * side[:, :1] + py * side[:, 1:]
-    along = px * side[:, 1:] - py * side[:, :1]
-    x -= lines.bend[:, None] * along**2
+    inside &= grid.reasons[rr, cc] == 0
+    uv = np.full((*rr.shape, 2), np.nan)
+    uv[inside] = geometry.project(projector, grid.xyz[rr[inside], cc[inside]].astype(np.float64))
+    x, along = st.beside(uv)
     dark, white, lit = (_sampled(f, rr, cc) for f in (shot.dark, shot.white, shot.guided))
     top = float(shot.pixel_format.max_value)
-    usable = inside & (np.abs(x) <= reach_across) & (np.abs(along) <= reach_along)
+    with np.errstate(invalid="ignore"):
+        usable = inside & (x >= st.low[:, None]) & (x <= st.high[:, None]) & (np.abs(along) <= st.reach[:, None])
     usable &= (white < top) & (lit < top) & (white - dark > 4 * top / 255)
     full = np.where(usable, white - dark, 1.0)
-    ratio = np.where(usable, (lit - dark) / full, 0.0)
-    kind = (rr % 2) * 2 + cc % 2 if shot.pixel_format.is_bayer else np.zeros_like(rr)
-    middle = np.abs(x) <= (np.nan_to_num(half, nan=0.3) * wide)[:, None]
-    weight, ratio = _one_scale(ratio, full * usable, kind, middle, usable)
-    return _fit(x, ratio, weight, np.nan_to_num(half, nan=0.3) * wide, s, per_mm)
+    # a camera's blur draws the line's edge to where the tissue is brighter
+    x = x + _gradient(shot, rr, cc, side) * (BLUR_PIXELS**2 / slope)[:, None]
+    kinds = [np.arange(len(du))]
+    if shot.pixel_format.is_bayer:
+        kinds = [np.flatnonzero((dv % 2 == i) & (du % 2 == j)) for i in (0, 1) for j in (0, 1)]
+    half = st.half / st.per_mm
+    widths = np.stack([-st.low - half, 2 * half, st.high - half], 1)
+    return _Profiles(
+        np.where(usable, x, 0.0), np.where(usable, (lit - dark) / full, 0.0), full * usable, kinds, half,
+        st.bend * st.pace**2 / st.per_mm, 2 * (st.reach * pace * np.abs(slope))[:, None] * widths / stride**2,
+    )  # fmt: skip
+
+
+def _gradient(shot: Shots, r: Any, c: Any, side: F64) -> F64:
+    """By how much the logarithm of what all mirrors light grows for a pixel across the line (n, m)."""
+    far = 2 if shot.pixel_format.is_bayer else 1
+    H, W = shot.dark.shape[:2]
+    floor = 4 * float(shot.pixel_format.max_value) / 255
+
+    def log(dr: int, dc: int) -> F64:
+        at = np.clip(r + dr, 0, H - 1), np.clip(c + dc, 0, W - 1)
+        return np.asarray(np.log(np.maximum(_sampled(shot.white, *at) - _sampled(shot.dark, *at), floor)))
+
+    across, down = (log(0, far) - log(0, -far)) / (2 * far), (log(far, 0) - log(-far, 0)) / (2 * far)
+    return np.asarray(across * side[:, :1] + down * side[:, 1:])
 
 
 def _sampled(frame: AnyArray, r: Any, c: Any) -> F32:
@@ -259,74 +242,111 @@ def _sampled(frame: AnyArray, r: Any, c: Any) -> F32:
     return np.asarray(f.mean(-1) if f.ndim == 3 else f, np.float32)
 
 
-def _one_scale(ratio: F32, full: F32, kind: Any, middle: Bool, usable: Bool) -> tuple[F64, F64]:
-    """Weights, and ratios as multiples of what each kind of pixel (of a colour mosaic) shows of the line's colour."""
-    weight, out = np.zeros(ratio.shape), np.zeros(ratio.shape)
-    for k in range(int(kind.max()) + 1 if kind.size else 0):
-        mine = (kind == k) & usable
-        core = mine & middle
-        if core.sum() < 5:
-            continue
-        level = float(np.percentile(ratio[core], 80))
-        if level < 0.03:
-            continue
-        out[mine] = ratio[mine] / level
-        weight[mine] = (full[mine] * level) ** 2 / np.maximum(full[mine], 1.0)
-    return weight, out
+def _levels(profiles: Sequence[_Profiles]) -> list[float]:
+    """How bright the middle of the line is to each kind of pixel, as a share of the light of all mirrors; 0 = dark."""
+    out = []
+    for k in range(max((len(p.kinds) for p in profiles), default=0)):
+        core = []
+        for p in profiles:
+            c = p.kinds[k]
+            core.append(p.y[:, c][(p.w[:, c] > 0) & (np.abs(p.x[:, c]) <= p.half[:, None])])
+        every = np.concatenate(core)
+        level = float(np.percentile(every, 80)) if len(every) >= 5 else 0.0
+        out.append(level if level >= DARK else 0.0)
+    return out
 
 
-def _fit(x: F64, y: F64, w: F64, half_px: F64, s: LoopSettings, per_mm: float) -> tuple[F64, F64]:
-    """Centre of a line's profile `y` (n, m) at `x`, weights `w`: least squares over place, height and ground."""
+def _fit(
+    p: _Profiles, levels: Sequence[float], search: F64, blur: F64, per_mm: F64, s: LoopSettings
+) -> tuple[F64, F64]:
+    """Centres of lines (n,), mm, and their errors: least squares over the place, and the height and ground that each
+    kind of pixel sees.
+    """
     from scipy.special import erf
 
-    n = len(x)
-    out, error = np.full(n, np.nan), np.full(n, np.nan)
-    if not n:
+    out, error = np.full(len(p.x), np.nan), np.full(len(p.x), np.nan)
+    kinds = [(c, level) for c, level in zip(p.kinds, levels, strict=True) if level]
+    if not kinds:
         return out, error
-    span = s.search_mm * per_mm
-    tries = np.linspace(-span, span, REACHES)
-    blur = math.hypot(s.blur_mm * per_mm, 0.4)
-    enough = (w > 0).sum(1) >= 12
-
-    def cost(centre: F64, rows: Any) -> tuple[F64, F64, F64]:
-        d = x[rows] - centre[:, None]
-        a = half_px[rows][:, None]
-        t = 0.5 * (erf((d + a) / (math.sqrt(2) * blur)) - erf((d - a) / (math.sqrt(2) * blur)))
-        ww, yy = w[rows], y[rows]
-        s0, st, stt = ww.sum(1), (ww * t).sum(1), (ww * t * t).sum(1)
-        sy, sty, syy = (ww * yy).sum(1), (ww * t * yy).sum(1), (ww * yy * yy).sum(1)
-        det = s0 * stt - st * st
-        det = np.where(det > 0, det, np.nan)
-        height = (s0 * sty - st * sy) / det
-        ground = (stt * sy - st * sty) / det
-        return syy - height * sty - ground * sy, height, s0
-
-    rows = np.flatnonzero(enough)
+    every = np.concatenate([c for c, _ in kinds])
+    cuts = np.concatenate([[0], np.cumsum([len(c) for c, _ in kinds])])
+    level = np.array([level for _, level in kinds])
+    x, y, w = p.x[:, every], p.y[:, every], p.w[:, every]
+    half = p.half[:, None]
+    sides = (x < -half, np.abs(x) <= half, x > half)
+    if np.median((w > 0).sum(1)) < FEW * len(kinds):  # too few for each kind: all see the line as bright as they should
+        scale = np.repeat(level, np.diff(cuts))
+        y, w = y / scale, w * scale**2
+        cuts, level = np.array([0, len(every)]), np.ones(1)
+    else:  # a kind of pixel that sees the line from one side only, or in part, does not tell where it is
+        counts = [np.add.reduceat((w > 0) & side, cuts[:-1], axis=1) for side in sides]
+        w = w * np.repeat(np.all([n >= _enough(n) for n in counts], axis=0), np.diff(cuts), axis=1)
+    counted = np.stack([((w > 0) & side).sum(1) for side in sides], 1)
+    rows = np.flatnonzero((counted >= np.maximum(LEAST, SIDE_SHARE * p.room * len(kinds) / len(p.kinds))).all(1))
     if not rows.size:
         return out, error
-    table = np.stack([cost(np.full(len(rows), c), rows)[0] for c in tries], 1)
-    table = np.where(np.isfinite(table), table, np.inf)
-    best = table.argmin(1)
-    centre = tries[best]
-    inner = (best > 0) & (best < REACHES - 1)
-    step = tries[1] - tries[0]
-    for _ in range(3):  # a parabola through three costs, ever closer
-        low, mid, high = (cost(centre + d, rows)[0] for d in (-step, 0.0, step))
-        bend = low - 2 * mid + high
+    x, y, w, half, span, blur, per_mm, bow = (a[rows] for a in (x, y, w, half, search, blur, per_mm, p.bow))
+
+    def sums(a: F64) -> F64:
+        return np.asarray(np.add.reduceat(a, cuts[:-1], axis=1))
+
+    wy = w * y
+    s0, sy, syy = sums(w), sums(wy), sums(wy * y)
+    expected = (s0 * level).sum(1)
+
+    def cost(centre: F64, blur: F64) -> tuple[F64, F64, F64]:
+        """What is left of the light's squares with lines at `centre`; their height, of what it should be, and power.
+
+        A blurred line that bends is brighter on the inner side of its bend.
+        """
+        soft = math.sqrt(2) * blur[:, None]
+        d = x - (centre + bow * blur**2)[:, None]
+        t = 0.5 * (erf((d + half) / soft) - erf((d - half) / soft))
+        wt = w * t
+        st, stt, sty = sums(wt), sums(wt * t), sums(wt * y)
+        det = s0 * stt - st * st
         with np.errstate(invalid="ignore", divide="ignore"):
-            move = np.where(bend > 0, 0.5 * (low - high) / bend, 0.0) * step
-        centre = centre + np.clip(np.nan_to_num(move), -step, step)
-        step *= 0.4
-    left, height, total = cost(centre, rows)
-    bend = cost(centre + step, rows)[0] - 2 * left + cost(centre - step, rows)[0]
+            height = np.where(det > 1e-6 * s0 * s0, (s0 * sty - st * sy) / det, 0.0)
+            ground = np.where(s0 > 0, (sy - st * height) / s0, 0.0)
+        left = syy - height * sty - ground * sy
+        return left.sum(1), (s0 * height).sum(1) / expected, (s0 * height**2).sum(1)
+
+    def refined(centre: F64, step: F64, blur: F64) -> tuple[F64, F64]:
+        for _ in range(3):  # a parabola through three costs, ever closer
+            low, mid, high = (cost(centre + d, blur)[0] for d in (-step, 0.0, step))
+            bend = low - 2 * mid + high
+            with np.errstate(invalid="ignore", divide="ignore"):
+                move = np.where(bend > 0, 0.5 * (low - high) / bend, 0.0) * step
+            centre = centre + np.clip(np.nan_to_num(move), -step, step)
+            step = 0.4 * step
+        return centre, step
+
+    tries = np.linspace(-1, 1, REACHES)
+    table = np.stack([cost(c * span, blur)[0] for c in tries], 1)
+    best = table.argmin(1)
+    inner = (best > 0) & (best < REACHES - 1)
+    first = (tries[1] - tries[0]) * span
+    centre, _ = refined(tries[best] * span, first, blur)
+    # how soft the lines are is told by all of them together
+    softer = [float((left / np.maximum(power, 1e-9))[inner].sum()) for left, _, power in
+              (cost(centre, f * blur) for f in SOFTER)]  # fmt: skip
+    blur = SOFTER[int(np.argmin(softer))] * blur
+    centre, step = refined(centre, 0.4 * first, blur)
+    left, height, power = cost(centre, blur)
+    bend = cost(centre + step, blur)[0] - 2 * left + cost(centre - step, blur)[0]
     with np.errstate(invalid="ignore", divide="ignore"):
-        noise = left / np.maximum((w[rows] > 0).sum(1) - 3, 1)
+        noise = left / np.maximum((w > 0).sum(1) - 3, 1)
         err = np.sqrt(2 * np.maximum(noise, 0) / (bend / step**2))
-        misfit = np.sqrt(np.maximum(left, 0) / total)
-        good = inner & (height > s.min_height) & (misfit < s.max_misfit * height) & np.isfinite(err) & (err < 0.5)
+        good = inner & (height > s.min_height) & (left < s.max_misfit**2 * power)
+        good &= np.isfinite(err) & (err * per_mm < 0.5)
     out[rows[good]] = centre[good]
-    error[rows[good]] = np.maximum(err[good], 0.01)
+    error[rows[good]] = np.maximum(err[good], 0.01 / per_mm[good])
     return out, error
+
+
+def _enough(counts: AnyArray) -> AnyArray:
+    """How many pixels of a kind, of `counts` (n, kinds), are enough (n, 1)."""
+    return np.asarray(np.maximum(1, KIND_SHARE * counts.max(1, keepdims=True)))
 
 
 def _triangulate(offset: F64, sigma: F64, slopes: F64, s: LoopSettings) -> tuple[F64, F64]:

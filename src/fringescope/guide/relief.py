@@ -97,6 +97,30 @@ class Relief:
             left[go] -= step
         return p, d, ground
 
+    def paths(self, start: F64, direction: F64, distance: float, most_air_mm: float) -> tuple[F64, F64, Bool, Bool]:
+        """The ways of n walkers, who stop where the surface jumps, and at holes wider than `most_air_mm`.
+
+        Returns the places (k + 1, n, 3) after each of k equal steps, the directions (n, 3) in which they look in the
+        end, and, of each step (k + 1, n), whether they still walk then, and whether the ground was measured there.
+        """
+        k = max(1, int(np.ceil(distance / STEP_MM)))
+        step = distance / k
+        p, d = start.astype(np.float64).copy(), _unit(direction)
+        air, goes, ground = np.zeros(len(p)), np.ones(len(p), bool), np.ones(len(p), bool)
+        ways, walks, grounds = [p.copy()], [goes.copy()], [ground.copy()]
+        for _ in range(k):
+            go = np.flatnonzero(goes)
+            p[go], d[go], ground[go] = self._step(p[go], d[go], np.full(len(go), step))
+            air[go] = np.where(ground[go], 0.0, air[go] + step)
+            off = go[~ground[go]]
+            other = np.isfinite(self.depth_at(geometry.project(self.projector, p[off])))  # a jump, and no hole
+            air[off[other]] = np.inf
+            goes = goes & (air <= most_air_mm)
+            ways.append(p.copy())
+            walks.append(goes.copy())
+            grounds.append(ground & goes)
+        return np.stack(ways), d, np.stack(walks), np.stack(grounds)
+
     def _step(self, p: F64, d: F64, step: F64) -> tuple[F64, F64, Bool]:
         ahead = p + d * step[:, None]
         uv = geometry.project(self.projector, ahead)

@@ -195,6 +195,12 @@ def length(t: Trace, sigma_mm: float) -> tuple[float, float]:
     return total, math.sqrt((2.0 + bends) * s * s)
 
 
+def usual_sigma(t: Trace) -> float:
+    """Median error of a trace's places, mm; 0 where none is known."""
+    known = t.sigma[np.isfinite(t.sigma)]
+    return float(np.median(known)) if len(known) else 0.0
+
+
 def guided(stroke: Stroke, traces: list[Trace], notes: tuple[str, ...], area: tuple[float, float] | None) -> Guided:
     """The record of a stroke: its visible pieces, what is hidden, length, expected error."""
     segments, lands, errors, hidden = [], [], [], []
@@ -206,7 +212,7 @@ def guided(stroke: Stroke, traces: list[Trace], notes: tuple[str, ...], area: tu
             errors.append(t.sigma[a:b])
         hidden += hidden_parts(t)
         if len(t):
-            one, sigma = length(t, float(np.nanmedian(t.sigma)))
+            one, sigma = length(t, usual_sigma(t))
             total, variance = total + one, variance + sigma**2
     every: F64 | U8 = np.concatenate(errors) if errors else np.zeros(0)
     return Guided(

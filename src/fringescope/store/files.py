@@ -276,7 +276,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     except (OSError, ValueError) as e:
         raise FormatError(f"{path}: cannot read {what}: {_why(e) if isinstance(e, OSError) else e}") from e
     try:
-        out = json.loads(data.decode("utf-8-sig"))
+        out = json.loads(data.decode("utf-8-sig"), parse_int=_whole)
     except RecursionError:
         raise FormatError(f"{path}: not {what}: nested too deeply") from None
     except ValueError as e:
@@ -284,6 +284,11 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     if not isinstance(out, dict):
         raise FormatError(f"{path}: not {what}: needed a JSON object, came {type(out).__name__}")
     return out
+
+
+def _whole(text: str) -> int | float:
+    """A whole number of JSON; one of thousands of digits is infinite, which who needs it refuses."""
+    return int(text) if len(text) <= 4000 else float(text)
 
 
 def check_format(doc: Mapping[str, Any], path: Path, format_: str, version: int) -> None:

@@ -118,6 +118,8 @@ def _stroke(name: str, d: Mapping[str, Any]) -> Stroke:
     if d.get("count") is not None:
         if not isinstance(d["count"], int) or isinstance(d["count"], bool):
             raise GuidanceError(f"count is {files.shown(d['count'])}; needed a whole number")
+        if abs(d["count"]) > 1_000_000:
+            raise GuidanceError(f"count is {files.shown(d['count'])}; needed 1 to 100 parallel lines")
         given["count"] = d["count"]
     for key, kind in (("kind", StrokeKind), ("fill", Fill), ("side", Side)):
         if d.get(key) is not None:
@@ -145,7 +147,10 @@ def _number(d: Mapping[str, Any], key: str) -> float | None:
         return None
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         raise GuidanceError(f"{key} is {files.shown(value)}; needed a number")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:  # a whole number beyond what floats hold
+        raise GuidanceError(f"{key} is {files.shown(value)}; needed a number of an everyday size") from None
 
 
 def _choice(key: str, value: Any, kind: type[StrokeKind] | type[Fill] | type[Side]) -> Any:
