@@ -173,6 +173,10 @@ def test_the_verb_writes_picture_record_and_previews(
     assert call(scanned, tmp_path / "g.json", out) == 1
     assert "--force" in capsys.readouterr().err
     assert out.read_bytes() == before
+    assert call(scanned, tmp_path / "g.json", out, "--force", "--no-preview") == 1
+    assert "is no record of guidance" in capsys.readouterr().err
+    kept.unlink()
+    assert call(scanned, tmp_path / "g.json", out, "--force", "--no-preview") == 0
     assert call(scanned, tmp_path / "g.json", out, "--force", "--no-preview") == 0
 
 

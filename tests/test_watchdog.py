@@ -436,11 +436,11 @@ def test_a_watchdog_that_cannot_start_is_named_and_nothing_is_shown(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     p = station.projector
-    real = watchdog._described
-    monkeypatch.setattr(watchdog, "_described", lambda s: real(s) | {"module": "no_such_module"})
+    real = watchdog.described
+    monkeypatch.setattr(watchdog, "described", lambda s: real(s) | {"module": "no_such_module"})
     with pytest.raises(DeviceLostError, match=r"nothing is shown without one: .*no_such_module"):
         Guard(p).start()
-    monkeypatch.setattr(watchdog, "_described", real)
+    monkeypatch.setattr(watchdog, "described", real)
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     with pytest.raises(DeviceLostError, match="no watchdog"):
         Guard(p).start()
