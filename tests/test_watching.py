@@ -13,10 +13,10 @@ from fringescope import capture, patterns, pipeline, store
 from fringescope.cli import run
 from fringescope.devices import base, simulated
 from fringescope.errors import CaptureError, IncompleteShotError
-from fringescope.pipeline import watching
+from fringescope.pipeline import guidance, projecting, watching
 from fringescope.settings import Settings
 from fringescope.twin import changes, presets, scene
-from fringescope.types import NoiseModel, Scan, Standing, ViewInput
+from fringescope.types import Guidelines, NoiseModel, Scan, Standing, Stroke, ViewInput
 
 S = Settings()
 SCALE = 0.05
@@ -26,7 +26,9 @@ def world(name: str = "tissue-folded", preset: str = "pair", noise: int = 1) -> 
     return simulated.World(scene.make(name, 6), presets.instrument(preset, SCALE), noise, rays=1)
 
 
-def scanned(w: simulated.World, light: bool = True) -> tuple[Scan, dict[str, NoiseModel], dict[str, tuple]]:
+def scanned(
+    w: simulated.World, light: bool = True, surface: bool = False
+) -> tuple[Scan, dict[str, NoiseModel], dict[str, tuple]]:
     """A scan of a world, and what its figures tell of noise and fringes."""
     rig = w.instrument.rig
     formats = dict(zip([c.name for c in rig.cameras], w.instrument.pixel_formats, strict=True))
@@ -36,7 +38,7 @@ def scanned(w: simulated.World, light: bool = True) -> tuple[Scan, dict[str, Noi
         views: tuple[ViewInput, ...] = capture.collect(
             s.projector, s.cameras, s.light if light else None, images, plan, S.capture
         )
-    made = pipeline.scan(views, rig, S, surface=False)
+    made = pipeline.scan(views, rig, S, surface=surface)
     told = made.figures["views"]
     noise = {c: NoiseModel(v["noise"]["a"], v["noise"]["b"]) for c, v in told.items()}
     return made, noise, {c: tuple(tuple(g) for g in v["directions"]) for c, v in told.items()}
@@ -85,6 +87,32 @@ def test_a_scan_without_a_ring_light_is_watched_in_the_projectors() -> None:
         s.world.change(changes.moved(w.scene, changes.motion(np.array([0.3, 0, 0]), np.zeros(3), np.zeros(3))))
         found = watching.watch(s, made.grids, made.pictures, rig, S, noise=noise, gradients=gradients)
         assert found.verdict is Standing.STALE
+
+
+@pytest.mark.parametrize("name", ["tissue-domed", "tissue-folded", "tissue-thin"])
+def test_projected_lines_are_no_change_of_the_specimen(name: str) -> None:
+    """White lines over shine, folds and rims, also where a camera has no points: it is VALID all the same."""
+    w = world(name, "paper")
+    made, noise, _ = scanned(w, surface=True)
+    rig, rng = w.instrument.rig, np.random.default_rng(4)
+    tissue = guidance.tissue_of(made.grids, made.surface, rig, S)
+    rows, columns = np.nonzero(made.grids[0].valid)
+    strokes = []
+    for k in range(4):
+        pick = rng.integers(0, len(rows), 3)
+        points = np.stack([columns[pick], rows[pick]], 1).astype(np.float64)
+        strokes.append(Stroke(f"s{k}", camera="camera1", pixels=points, width_mm=0.8, color=(255, 255, 255)))
+    shown = guidance.project_guidance(Guidelines(tuple(strokes)), tissue, S)
+    masks = projecting.lit_masks(shown, tissue)
+    with again(w) as s:
+        s.projector.show(shown.image)
+        how = {"noise": noise}
+        found = watching.watch(s, made.grids, made.pictures, rig, S, **how, masks=masks)
+        assert found.verdict is Standing.VALID, found.why
+        assert watching.watch(s, made.grids, made.pictures, rig, S, **how).verdict is not Standing.VALID
+        shift = changes.motion(np.array([0.4, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+        s.world.change(changes.moved(w.scene, shift))
+        assert watching.watch(s, made.grids, made.pictures, rig, S, **how, masks=masks).verdict is Standing.STALE
 
 
 def test_a_camera_that_is_missing_makes_it_suspect(pair) -> None:

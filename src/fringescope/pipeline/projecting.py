@@ -18,6 +18,7 @@ from fringescope.errors import FringescopeError
 from fringescope.settings import Settings
 from fringescope.types import Bool, Guidance, Standing, Watched
 
+LIT = 0.01  #: of full light; less does not change a picture
 GLOW_MM = 2.5  #: so far around the projected lines the tissue, and the wall of a fold beside them, glow too
 
 
@@ -44,6 +45,8 @@ def lit_masks(guidance: Guidance, tissue: guide.Tissue) -> dict[str, Bool]:
     """Which pixels (H, W) of each camera the projected lines, and their glow, change: by the camera's name."""
     projector = tissue.rig.projector
     light = report.plane_light(guidance.image, projector).max(axis=2)
+    shone = tissue.relief.at(np.argwhere(light > LIT)[:, ::-1].astype(np.float64))  # also where a camera has no points
+    shone = shone[np.isfinite(shone).all(axis=1)]
     out = {}
     for grid, footprint in zip(tissue.grids, tissue.footprints, strict=True):
         uv = geometry.project(projector, grid.xyz).astype(np.float32)
@@ -51,7 +54,13 @@ def lit_masks(guidance: Guidance, tissue: guide.Tissue) -> dict[str, Bool]:
         lit = cv2.remap(light, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         reach = max(1, round(GLOW_MM / footprint)) if footprint else 1
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        out[grid.camera] = cv2.dilate((lit > 0.01).astype(np.uint8), around) > 0
+        mask = (lit > LIT).astype(np.uint8)
+        at = geometry.project(tissue.rig.cameras[grid.view], shone)
+        h, w = mask.shape
+        with np.errstate(invalid="ignore"):
+            at = np.rint(at[((at > -0.5) & (at < [w - 0.5, h - 0.5])).all(axis=1)]).astype(np.intp)
+        mask[at[:, 1], at[:, 0]] = 1
+        out[grid.camera] = cv2.dilate(mask, around) > 0
     return out
 
 
