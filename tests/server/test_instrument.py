@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import time
@@ -11,7 +12,10 @@ from typing import Any
 import pytest
 
 from fringescope.client import Client, HubCase, HubError, HubVersion, Room
+from fringescope.errors import RejectedError
 from fringescope.server.config import Config
+from fringescope.server.processes.child import Call
+from fringescope.server.processes.instrument import Hand
 from fringescope.server.running import Server
 from fringescope.settings import from_dict
 from tests.server.conftest import DEVICE, PASSWORD, populate
@@ -84,6 +88,18 @@ def soon(true: Callable[[], bool], seconds: float = 10.0) -> bool:
     return False
 
 
+def test_a_stop_overtakes_whatever_waits() -> None:
+    """The word to go dark is heard at once, while a picture that was asked for before it still waits for its turn."""
+    hand = Hand(lambda _event: None)
+    hand.open_(Call(1, -1), DEVICE.replace("0.06", "0.02"))
+    hand.dark(Call(9, -1))
+    with pytest.raises(RejectedError, match="stopped meanwhile"):
+        hand.show(Call(8, -1), "a", "b")
+    with pytest.raises(RejectedError, match="nothing is ready"):
+        hand.show(Call(10, -1), "a", "b")
+    hand.ended()
+
+
 def test_a_scan_is_there_for_all_with_its_files(case: HubCase) -> None:
     (scan,) = case.scans()
     names = {f.name: f for f in scan.files}
@@ -117,6 +133,19 @@ def test_confirmed_lines_come_to_the_projector_and_go(operator: Client, room: Ro
     stopped = room.wait(version, "stopped")
     assert "done" in stopped.why
     assert soon(lambda: operator.instrument().projecting is None, 1.0)
+
+
+def test_a_stop_on_the_heels_of_a_start_leaves_it_dark(bench: Server, room: Room) -> None:
+    assert bench.loop is not None
+    for k in range(5):
+        v = room.arm(ready(room, 8.0 + 0.1 * k))
+        room.say({"kind": "start", "version": v.number, "pattern": v.pattern}, wait=False)
+        room.stop()
+        assert room.wait(v, "stopped", timeout_s=10).why.startswith("stopped by")
+        for _ in range(5):
+            time.sleep(0.03)
+            asked = asyncio.run_coroutine_threadsafe(bench.site.instrument.shown(), bench.loop)
+            assert not asked.result(10)
 
 
 def test_the_pattern_that_was_confirmed_is_the_one_of_the_files(case: HubCase, room: Room) -> None:

@@ -22,6 +22,7 @@ from fringescope.server import cases
 from fringescope.server.blobs import Blobs
 from fringescope.server.config import Config
 from fringescope.server.hub import INSTRUMENT, Hub
+from fringescope.server.processes.child import STOPPED
 from fringescope.server.processes.parent import Child
 from fringescope.server.rights import Speaker
 from fringescope.server.shelf import Shelf
@@ -276,8 +277,10 @@ class Instrument:
             made = await self._devices.call("show", whole=v.pattern, dashed=v.dashed)
         except FringescopeError as e:
             self._shown = None
-            await self._lost(str(e))
-            raise
+            if str(e) != STOPPED:
+                await self._lost(str(e))
+                raise
+            return
         await self._testify(case, effect, made["shown_ns"])
 
     async def _testify(self, case: str, effect: Show, shown_ns: int) -> None:
@@ -367,6 +370,10 @@ class Instrument:
         await self.open()
         found: dict[str, Any] = await self._devices.call("live", camera=camera, width=width, quality=quality)
         return found
+
+    async def shown(self) -> bool:
+        """Whether the projector itself says that it holds a picture. Raises DeviceError."""
+        return bool(await self._devices.call("shown"))
 
     async def befall(self, what: dict[str, str]) -> None:
         """For the simulated instrument: something happens to the specimen."""

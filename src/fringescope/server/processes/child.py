@@ -20,6 +20,7 @@ from typing import Any
 
 from fringescope.errors import FringescopeError
 
+STOPPED = "stopped meanwhile: nothing is projected"  #: what a call says that was overtaken by a stop
 _LOCK = threading.Lock()
 _CANCELLED: set[int] = set()
 

@@ -28,7 +28,7 @@ from fringescope.errors import CaptureError, DeviceError, FringescopeError, Reje
 from fringescope.pipeline import guidance as recipe
 from fringescope.pipeline import projecting, watching
 from fringescope.pipeline.selftest import self_test
-from fringescope.server.processes.child import Call
+from fringescope.server.processes.child import STOPPED, Call
 from fringescope.settings import Settings, from_dict
 from fringescope.store.images import decode_png
 from fringescope.types import U8, Standing, ViewInput
@@ -54,6 +54,7 @@ class _Ready:
         self.standing: Standing | None = None
         self._lit: U8 | None = None
         self._look, self._over = look, threading.Event()
+        self._switch = threading.RLock()  #: nobody turns on what somebody else is turning off
         self._failed = 0
         self.guard = Guard(station.projector, s.guard)
         self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
@@ -81,8 +82,7 @@ class _Ready:
         except FringescopeError as e:
             self._failed += 1
             if self._failed > 2:
-                self.pair = None
-                self.station.projector.dark()
+                self.dark()
                 self._emit({"lost": "cameras", "why": str(e)})
             return
         self._failed = 0
@@ -103,21 +103,24 @@ class _Ready:
         for h in (whole, dashed):
             if h not in self.images:
                 raise RejectedError(f"picture {h[:12]} was not loaded; preview it again")
-        self.pair = whole, dashed
-        self._show()
+        with self._switch:
+            self.pair = whole, dashed
+            self._show()
 
     def _show(self) -> None:
-        if self.pair is None:
-            return
-        image = self.images[self.pair[self.standing is Standing.SUSPECT]]
-        grey = not self.station.projector.info.colours
-        if self.station.projector.shown is None or self._lit is not image:
-            self.station.projector.show(np.asarray(image.max(axis=2)) if grey else image)
-            self._lit = image
+        with self._switch:
+            if self.pair is None:
+                return
+            image = self.images[self.pair[self.standing is Standing.SUSPECT]]
+            grey = not self.station.projector.info.colours
+            if self.station.projector.shown is None or self._lit is not image:
+                self.station.projector.show(np.asarray(image.max(axis=2)) if grey else image)
+                self._lit = image
 
     def dark(self) -> None:
-        self.pair = None
-        self.station.projector.dark()
+        with self._switch:
+            self.pair = None
+            self.station.projector.dark()
 
     def _watch(self) -> None:
         """Looks again and again; however it ends unasked, it is dark and the hub hears of it."""
@@ -153,10 +156,11 @@ class Hand:
         self._station: Station | None = None
         self._uri = ""
         self._ready: _Ready | None = None
+        self._dark_from = 0  #: calls with a lower number were made before somebody said dark: they light nothing
         self.calls: dict[str, Callable[..., Any]] = {
             "open": self.open_, "close": self.close, "capture": self.capture, "ready": self.ready, "rest": self.rest,
             "look": self.look, "live": self.live, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
-            "selftest": self.selftest,
+            "selftest": self.selftest, "shown": self.shown,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {"dark": self.dark, "beat": self.beat}
 
@@ -221,6 +225,7 @@ class Hand:
             nonlocal done
             for item in frames:
                 done += 1
+                self._not_dark(call)
                 call.progress(f"fringes {camera}", 0.1 + 0.9 * done / total)
                 yield item
 
@@ -272,15 +277,27 @@ class Hand:
         button = self._ready.guard.button()
         return {"switch": described(button.switch), "patience_ms": button.patience_ms}
 
-    def show(self, _call: Call, whole: str, dashed: str) -> dict[str, Any]:
-        """Projects a loaded picture."""
+    def show(self, call: Call, whole: str, dashed: str) -> dict[str, Any]:
+        """Projects a loaded picture, unless somebody said dark after this was asked for."""
+        self._not_dark(call)
         if self._ready is None:
             raise RejectedError("nothing is ready to be projected; preview it again")
         if self._ready.guard.lost:
             raise RejectedError(f"the projector is dark ({self._ready.guard.lost}); preview it again")
         self._ready.guard.lease(LEASE_S)
         self._ready.show(whole, dashed)
+        if call.number < self._dark_from:  # while it was being turned on
+            self._ready.dark()
+            self._not_dark(call)
         return {"shown_ns": time.time_ns()}
+
+    def _not_dark(self, call: Call) -> None:
+        if call.number < self._dark_from:
+            raise RejectedError(STOPPED)
+
+    def shown(self, _call: Call) -> bool:
+        """Whether the projector itself says that it holds a picture."""
+        return self._opened().projector.shown is not None
 
     def rest(self, _call: Call) -> None:
         """Dark, no watchdog, nobody looks: the devices are free."""
@@ -335,8 +352,9 @@ class Hand:
         if now is not None and not now.guard.lost:
             now.guard.lease(LEASE_S)
 
-    def dark(self, _call: Call) -> dict[str, Any]:
-        """Dark at once, whatever is being done."""
+    def dark(self, call: Call) -> dict[str, Any]:
+        """Dark at once, whatever is being done; what was asked for before and waits lights nothing either."""
+        self._dark_from = max(self._dark_from, call.number)
         now = self._ready
         if now is not None:
             now.dark()
