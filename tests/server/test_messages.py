@@ -137,11 +137,10 @@ def test_what_is_too_long(quick: Server) -> None:
             socket.send(say({**COMMENT, "text": "x" * 700_000}))
             why = until(socket, "refusal")["why"]
             assert "at most 600000 are taken" in why
-            socket.send("x" * 3_000_000)
             with pytest.raises(ConnectionClosed) as e:
+                socket.send("x" * 3_000_000)
                 until(socket, "never")
-            assert e.value.rcvd is not None
-            assert e.value.rcvd.code == 1009
+            assert e.value.rcvd is None or e.value.rcvd.code == 1009  # None: cut while all that was still being sent
             room.draw(stroke("s"))
             assert room.seq == 4
 

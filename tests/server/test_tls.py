@@ -6,6 +6,7 @@ import os
 import ssl
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -70,12 +71,20 @@ def test_a_page_that_it_serves_itself_is_its_own(hub: Server) -> None:
     host = f"localhost:{hub.config.port}"
     with Client(hub.url, "operator", PASSWORD, verify=str(hub.config.certificate)) as operator:
         case = scanned(hub, operator)
-        for origin, fits in ((f"https://{host}", True), (f"http://{host}", False), ("https://localhost", False)):
+
+        def enter(origin: str, said: list[object]) -> None:
             with room_of(operator, case.id, ssl=context, Origin=origin, Host="localhost") as room:
-                if fits:
-                    heard(room, "welcome")
-                else:
-                    assert closed(room)[0] == 4403
+                said.append("welcome" if origin == f"https://{host}" and heard(room, "welcome") else closed(room)[0])
+
+        for origin, told in ((f"https://{host}", "welcome"), (f"http://{host}", 4403), ("https://localhost", 4403)):
+            said: list[object] = []
+            for _ in range(3):  # a handshake that a busy machine delays for ten seconds hangs in the client for good
+                tried = threading.Thread(target=enter, args=(origin, said), daemon=True)
+                tried.start()
+                tried.join(25)
+                if said:
+                    break
+            assert said[:1] == [told], origin
 
 
 def test_a_passkey_is_bound_to_a_page_that_was_named(hub: Server) -> None:
