@@ -13,6 +13,7 @@ with Client("http://127.0.0.1:8017", "anna", password) as hub:
 """
 
 from fringescope.client.hub import Client, HubCase, HubError
-from fringescope.client.room import HubVersion, Room, content_of_stroke
+from fringescope.client.room import HubVersion, Room
+from fringescope.wire.record import content_of_stroke
 
 __all__ = ["Client", "HubCase", "HubError", "HubVersion", "Room", "content_of_stroke"]

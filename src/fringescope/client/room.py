@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import queue
 import secrets
@@ -19,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from fringescope.client.hub import HubError
 from fringescope.wire.ops import Op, StrokeDocument
-from fringescope.wire.record import canonical
+from fringescope.wire.record import content_of_stroke
 from fringescope.wire.room import (
     CaughtUp,
     Event,
@@ -36,12 +35,6 @@ if TYPE_CHECKING:
     from fringescope.client.hub import HubCase
 
 _MESSAGE: TypeAdapter[Any] = TypeAdapter(FromServer)
-
-
-def content_of_stroke(document: Mapping[str, Any], meaning: str = "cut") -> str:
-    """The hash (SHA-256, hex) of a stroke and what it stands for, as the hub computes it."""
-    kept = {k: v for k, v in document.items() if v is not None}
-    return hashlib.sha256(canonical({"stroke": kept, "meaning": meaning})).hexdigest()
 
 
 @dataclass(frozen=True)

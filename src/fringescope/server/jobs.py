@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -18,7 +17,6 @@ from fringescope.wire import Job, JobState
 
 Tell = Callable[[str, float], None]
 Work = Callable[[Tell], Awaitable[dict[str, Any]]]
-_EVERY_S = 0.2  #: progress is written down so often at most
 _WAITING = 20  #: jobs that may wait
 
 
@@ -52,13 +50,8 @@ class Jobs:
         return job
 
     async def _run(self, job: Job, work: Work) -> None:
-        last = 0.0
-
         def tell(stage: str, share: float) -> None:
-            nonlocal last
             job.stage, job.share = stage, share
-            if time.monotonic() - last > _EVERY_S:
-                last = time.monotonic()
 
         try:
             async with self._turn:

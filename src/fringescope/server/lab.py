@@ -152,8 +152,8 @@ class Lab:
         """Photographs the board where it lies now, as the next pose; `board` begins a new session."""
         session = self._shelf.data / "session"
         if board is not None:
+            parse_board(board, session / "board.json")  # before the poses of the session before are let go
             shutil.rmtree(session, ignore_errors=True)
-            parse_board(board, session / "board.json")
             session.mkdir()
             write_json(session / "board.json", board)
         elif not (session / "board.json").exists():

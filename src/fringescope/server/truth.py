@@ -5,7 +5,6 @@ Pure logic, as `examination` is: the same events give the same truth, so a repla
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -29,7 +28,7 @@ from fringescope.types.examination import (
     Submit,
     What,
 )
-from fringescope.wire.record import Record, canonical
+from fringescope.wire.record import Record, content_of_stroke
 
 ERASED = "the case was erased; open another"
 MOST = 5000  #: strokes, layers or comments of a case
@@ -80,12 +79,6 @@ class Fold:
 
 class _NoError(Exception):
     """Why nothing comes of an event."""
-
-
-def content_of_stroke(document: Mapping[str, Any], meaning: str) -> str:
-    """The hash (SHA-256, hex) of a stroke and what it stands for: what its author submits and the operator confirms."""
-    kept = {k: v for k, v in document.items() if v is not None}
-    return hashlib.sha256(canonical({"stroke": kept, "meaning": meaning})).hexdigest()
 
 
 def follow(truth: Truth, r: Record, settings: ExaminationSettings | None = None) -> Fold:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,6 +49,12 @@ def canonical(value: Any) -> bytes:
 def digest_of(salt: str, payload: dict[str, Any]) -> str:
     """SHA-256, hex, of a payload with its salt."""
     return hashlib.sha256(salt.encode() + b"\n" + canonical(payload)).hexdigest()
+
+
+def content_of_stroke(document: Mapping[str, Any], meaning: str = "cut") -> str:
+    """The hash (SHA-256, hex) of a stroke and what it stands for: what its author submits and the operator confirms."""
+    kept = {k: v for k, v in document.items() if v is not None}
+    return hashlib.sha256(canonical({"stroke": kept, "meaning": meaning})).hexdigest()
 
 
 def hash_of(r: Record) -> str:

@@ -229,7 +229,6 @@ def _why(e: ValidationError) -> str:
 
 # -------------------------------------------------------------------------------------------------------------- video
 
-_FRAME_MS = 1000.0
 QUALITIES = ((640, 50), (960, 60), (1280, 70), (1920, 80))  #: widths and JPEG qualities, from a poor line to a good one
 
 
