@@ -189,6 +189,17 @@ def test_a_hub_whose_instrument_dies_says_so_and_is_ready_again(bench: Server, r
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs POSIX signals")
+def test_after_the_stop_button_a_new_preview_lights_again(bench: Server, room: Room) -> None:
+    lit(room, 7.0)
+    button = bench.site.instrument.button
+    assert button is not None
+    button.press()
+    shown = bench.site.instrument
+    assert soon(lambda: not asyncio.run_coroutine_threadsafe(shown.shown(), bench.loop).result(10))
+    room.stop("the button was pressed")
+    lit(room, 8.0)
+
+
 def test_stop_reaches_a_projector_whose_process_hangs(bench: Server, room: Room) -> None:
     version = lit(room, 7.0)
     pid, button = bench.site.instrument.pid, bench.site.instrument.button

@@ -248,7 +248,8 @@ class Hand:
         """Starts the watchdog and the looking, and loads pictures (hash to file) that may be projected later."""
         station, s = self._opened(), from_dict(settings)
         images = {h: _read_png(path, h) for h, path in pictures.items()}
-        if self._ready is None or self._ready.scan != scan_id or self._ready.guard.lost:
+        cut = station.projector.cut is not None  # by the stop button; who previews again may light it again
+        if self._ready is None or self._ready.scan != scan_id or self._ready.guard.lost or cut:
             self.rest(call)
             station.projector.release()
             stored = store.read_scan(Path(scan), check=False)
