@@ -344,8 +344,14 @@ def test_progress_off_a_terminal_tells_only_slow_stages(capsys: pytest.CaptureFi
         progress("slow", 0, 1)
         progress._begun["slow"] -= 2.0
         progress("slow", 1, 1)
+        progress("long", 0, 9)
+        progress._begun["long"] -= 11.0
+        progress("long", 7, 9)
+        progress("long", 8, 9)
     err = capsys.readouterr().err
     assert "slow: 2.0 s" in err
+    assert "long: 7 of 9" in err
+    assert "long: 8" not in err  # not again so soon
     assert "quick" not in err
     assert progress.times_s["slow"] > 2
 

@@ -105,6 +105,23 @@ def make_world(scene: str, preset: str, scale: float, seed: int, layout: str, po
     return simulated.World(scenes.make(scene, seed, pose=pose, board=board), instrument, noise_seed, uri=uri)
 
 
+def world_of(uri: str) -> World:
+    """The world of a simulated instrument's URI; a scan of it names it with another draw of noise. Raises UsageError."""
+    from urllib.parse import parse_qsl, urlsplit, urlunsplit
+
+    from fringescope.devices import simulated
+
+    world = simulated.parse(uri)
+    parts = urlsplit(uri)
+    options = dict(parse_qsl(parts.query))
+    draw = int(options.get("noise", 1))
+    if draw:
+        options["noise"] = str(draw + 1)
+    query = "&".join(f"{k}={v}" for k, v in options.items())
+    world.uri = urlunsplit((parts.scheme, parts.netloc, parts.path, query, ""))
+    return world
+
+
 def make_plan(world: World, s: Settings) -> PatternPlan:
     """What to project over a scene: the paper's plan, or for a board both directions."""
     from fringescope import patterns
@@ -120,7 +137,11 @@ def make_plan(world: World, s: Settings) -> PatternPlan:
 @app.command()
 def simulate(
     scene: Annotated[
-        str, typer.Argument(help="plane, sphere, steps, board, tissue-domed, tissue-folded or tissue-thin.")
+        str,
+        typer.Argument(
+            help="plane, sphere, steps, board, tissue-domed, tissue-folded or tissue-thin; or a whole URI, as "
+            "'sim://paper/tissue-thin?seed=3&move=1,0,0', which says all of it."
+        ),
     ],
     out: Out,
     preset: Annotated[str, typer.Option(help="Instrument: paper, single, pair or five.")] = "paper",
@@ -154,7 +175,10 @@ def simulate(
         emit(told, json, [f"{out}: a session of {poses} poses", f"rig: {out / 'truth' / 'rig.json'}"])
         return
     with Progress() as progress, store.new_folder(out, marker="capture.json", force=force) as tmp:
-        world = make_world(scene, preset, scale, seed, layout, pose, board)
+        if scene.startswith("sim://"):
+            world = world_of(scene)
+        else:
+            world = make_world(scene, preset, scale, seed, layout, pose, board)
         simulate_into(tmp, world, make_plan(world, s), s, progress)
     c = store.read_capture(out)
     views = [{"camera": v.camera, "size": v.size, "frames": len(v.files)} for v in c.views]
