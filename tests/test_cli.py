@@ -19,12 +19,13 @@ import tifffile
 from fringescope import export, geometry, pipeline, store
 from fringescope.capture import photograph
 from fringescope.cli import run
-from fringescope.cli.capturing import make_world
+from fringescope.cli.capturing import make_world, world_of
 from fringescope.cli.common import Progress, load_settings
 from fringescope.cli.showing import errors
 from fringescope.devices import registry
 from fringescope.errors import UsageError
 from fringescope.settings import from_yaml, to_dict
+from fringescope.twin import scene
 from fringescope.types import Cloud, Grid, Scan
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -336,6 +337,25 @@ def test_a_bug_is_one_line_unless_debugged(monkeypatch: pytest.MonkeyPatch, caps
     assert len(err.splitlines()) == 1
     assert run(["settings", "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_scene_may_be_a_whole_uri(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    uri = "sim://single/plane?scale=0.03&rays=1&seed=2&layout=grid&ring=0.9"
+    assert run(["simulate", uri, "--out", str(tmp_path / "c")]) == 0
+    told = json.loads((tmp_path / "c" / "capture.json").read_text())
+    assert told["instrument"] == uri + "&noise=2"
+    assert told["projector"]["layout"] == "grid"
+    moved = world_of("sim://single/tissue-thin?scale=0.03&seed=2&move=1,0,0#camera1")
+    assert moved.uri == "sim://single/tissue-thin?scale=0.03&seed=2&move=1,0,0&noise=2"
+    still = scene.make("tissue-thin", 2).truth["tissue_mesh.npz"]["V"]
+    assert np.allclose(moved.scene.truth["tissue_mesh.npz"]["V"] - still, [1, 0, 0], atol=1e-6)
+    assert world_of("sim://single/plane?noise=0").uri == "sim://single/plane?noise=0"
+    capsys.readouterr()
+    assert run(["simulate", uri, "--preset", "pair", "--out", str(tmp_path / "e")]) == 2
+    assert "--preset" in capsys.readouterr().err
+    assert run(["simulate", "sim://single/tissue-thin?mov=1", "--out", str(tmp_path / "e")]) == 2
+    assert "unknown option 'mov'" in capsys.readouterr().err
+    assert not (tmp_path / "e").exists()
 
 
 def test_progress_off_a_terminal_tells_only_slow_stages(capsys: pytest.CaptureFixture[str]) -> None:

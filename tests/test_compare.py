@@ -282,6 +282,7 @@ def test_the_command(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert doc["before"] == json.loads((scans / "before" / "scan.json").read_text())["hash"]
     assert [g["id"] for g in doc["guidelines"]] == ["rim", "px"]
     assert doc["guidelines"][0]["median_mm"] < 0.5
+    assert any(w.startswith("rim: the cut ran ") for w in doc["words"])
     assert doc["specimen"]["before"]["found"]
     images = store.Images(out)
     depth = images.array("depth.tif")

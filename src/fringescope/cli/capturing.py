@@ -106,7 +106,7 @@ def make_world(scene: str, preset: str, scale: float, seed: int, layout: str, po
 
 
 def world_of(uri: str) -> World:
-    """The world of a simulated instrument's URI; a scan of it names it with another draw of noise. Raises UsageError."""
+    """The world of a simulated instrument's URI; its captures name it with another draw of noise. Raises UsageError."""
     from urllib.parse import parse_qsl, urlsplit, urlunsplit
 
     from fringescope.devices import simulated
@@ -162,6 +162,12 @@ def simulate(
     from fringescope import store
 
     s = load_settings(settings, set_)
+    if scene.startswith("sim://"):
+        usual = {"preset": "paper", "scale": 0.125, "seed": 0, "layout": "diamond", "pose": 0, "board": "checkerboard"}
+        given = {"preset": preset, "scale": scale, "seed": seed, "layout": layout, "pose": pose, "board": board}
+        for name in usual:
+            if given[name] != usual[name]:
+                raise UsageError(f"--{name} {given[name]} with {scene}; a URI says all of it: put it there")
     if poses:
         if scene != "board":
             raise UsageError(f"--poses {poses} of {scene}; a session shows a board: simulate board --poses {poses}")

@@ -63,7 +63,9 @@ def compare_into(
     store.check_pair(scans[0], scans[1], None if rig is None else store.hash_rig(rig))
     first, second = (export.read_ply(x.cloud) for x in scans)
     names, strokes, notes = ([], [], []) if guidelines is None else _drawn(guidelines, scans[0], first, r, s)
-    c = comparing.compare_scans(first, second, r, s, moved=register, strokes=strokes, progress=progress.share)
+    c = comparing.compare_scans(
+        first, second, r, s, moved=register, strokes=strokes, names=names, progress=progress.share
+    )
     surface = None if scans[1].surface is None else export.read_glb(scans[1].surface)
     title = f"{before.resolve().name} to {after.resolve().name}"
     doc: dict[str, Any] = progress.run(

@@ -101,7 +101,7 @@ def landing_picture(photo: F32, camera: Camera, index: int, landings: tuple[Land
                 _line(out, q, q + times * (p - q), (255, 64, 64), 1)
                 cv2.circle(out, (round(p[0] * 16), round(p[1] * 16)), 24, (64, 255, 96), -1, cv2.LINE_AA, 4)
         lines.append(f"{one.id}: {landing_caption(one)}")
-    return _captioned(out, [*lines, f"red: offset, {times} times as large"])
+    return _captioned(out, [f"red: offset, {times} times as large", *lines])
 
 
 def _srgb(light: AnyArray) -> U8:
