@@ -19,10 +19,11 @@ import tifffile
 from fringescope import export, geometry, pipeline, store
 from fringescope.capture import photograph
 from fringescope.cli import run
-from fringescope.cli.capturing import make_world, world_of
+from fringescope.cli.capturing import make_world
 from fringescope.cli.common import Progress, load_settings
 from fringescope.cli.showing import errors
 from fringescope.devices import registry
+from fringescope.devices.simulated import parse as world_of
 from fringescope.errors import UsageError
 from fringescope.settings import from_yaml, to_dict
 from fringescope.twin import scene
@@ -345,15 +346,15 @@ def test_a_scene_may_be_a_whole_uri(tmp_path: Path, capsys: pytest.CaptureFixtur
     told = json.loads((tmp_path / "c" / "capture.json").read_text())
     assert told["instrument"] == uri + "&noise=2"
     assert told["projector"]["layout"] == "grid"
-    moved = world_of("sim://single/tissue-thin?scale=0.03&seed=2&move=1,0,0#camera1")
-    assert moved.uri == "sim://single/tissue-thin?scale=0.03&seed=2&move=1,0,0&noise=2"
-    still = scene.make("tissue-thin", 2).truth["tissue_mesh.npz"]["V"]
-    assert np.allclose(moved.scene.truth["tissue_mesh.npz"]["V"] - still, [1, 0, 0], atol=1e-6)
+    moved = world_of("sim://single/board?scale=0.03&pose=1&move=1,0,0#camera1")
+    assert moved.uri == "sim://single/board?scale=0.03&pose=1&move=1,0,0&noise=2"
+    there, here = (np.array(s.truth["poses.json"][0]["t"]) for s in (moved.scene, scene.make("board", pose=1)))
+    assert np.allclose(there - here, [1, 0, 0])
     assert world_of("sim://single/plane?noise=0").uri == "sim://single/plane?noise=0"
     capsys.readouterr()
     assert run(["simulate", uri, "--preset", "pair", "--out", str(tmp_path / "e")]) == 2
     assert "--preset" in capsys.readouterr().err
-    assert run(["simulate", "sim://single/tissue-thin?mov=1", "--out", str(tmp_path / "e")]) == 2
+    assert run(["simulate", "sim://single/plane?mov=1", "--out", str(tmp_path / "e")]) == 2
     assert "unknown option 'mov'" in capsys.readouterr().err
     assert not (tmp_path / "e").exists()
 

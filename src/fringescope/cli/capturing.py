@@ -105,23 +105,6 @@ def make_world(scene: str, preset: str, scale: float, seed: int, layout: str, po
     return simulated.World(scenes.make(scene, seed, pose=pose, board=board), instrument, noise_seed, uri=uri)
 
 
-def world_of(uri: str) -> World:
-    """The world of a simulated instrument's URI; its captures name it with another draw of noise. Raises UsageError."""
-    from urllib.parse import parse_qsl, urlsplit, urlunsplit
-
-    from fringescope.devices import simulated
-
-    world = simulated.parse(uri)
-    parts = urlsplit(uri)
-    options = dict(parse_qsl(parts.query))
-    draw = int(options.get("noise", 1))
-    if draw:
-        options["noise"] = str(draw + 1)
-    query = "&".join(f"{k}={v}" for k, v in options.items())
-    world.uri = urlunsplit((parts.scheme, parts.netloc, parts.path, query, ""))
-    return world
-
-
 def make_plan(world: World, s: Settings) -> PatternPlan:
     """What to project over a scene: the paper's plan, or for a board both directions."""
     from fringescope import patterns
@@ -160,6 +143,7 @@ def simulate(
 ) -> None:
     """A capture of the simulated instrument, with its exact truth in truth/."""
     from fringescope import store
+    from fringescope.devices import simulated
 
     s = load_settings(settings, set_)
     if scene.startswith("sim://"):
@@ -182,7 +166,7 @@ def simulate(
         return
     with Progress() as progress, store.new_folder(out, marker="capture.json", force=force) as tmp:
         if scene.startswith("sim://"):
-            world = world_of(scene)
+            world = simulated.parse(scene)
         else:
             world = make_world(scene, preset, scale, seed, layout, pose, board)
         simulate_into(tmp, world, make_plan(world, s), s, progress)
