@@ -142,12 +142,13 @@ def _project(
     """Shows guidance under a watchdog for `seconds`, or until Ctrl-C. Raises GuidanceError where it had to go dark."""
     from fringescope.devices import registry
     from fringescope.devices.watchdog import Guard
-    from fringescope.pipeline import projecting, watching
+    from fringescope.pipeline import closing, projecting, watching
 
     pictures, masks = stored.every_picture(), projecting.lit_masks(made, tissue)
     end = None if seconds <= 0 else time.monotonic() + seconds
 
     with until_interrupted() as interrupted, registry.open_station(uri) as station:
+        closing.check_device(made, tissue.rig, station)
 
         def stop() -> bool:
             return interrupted() or (end is not None and time.monotonic() > end)
