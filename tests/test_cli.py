@@ -23,8 +23,10 @@ from fringescope.cli.capturing import make_world
 from fringescope.cli.common import Progress, load_settings
 from fringescope.cli.showing import errors
 from fringescope.devices import registry
+from fringescope.devices.simulated import parse as world_of
 from fringescope.errors import UsageError
 from fringescope.settings import from_yaml, to_dict
+from fringescope.twin import scene
 from fringescope.types import Cloud, Grid, Scan
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -338,14 +340,39 @@ def test_a_bug_is_one_line_unless_debugged(monkeypatch: pytest.MonkeyPatch, caps
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_a_scene_may_be_a_whole_uri(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    uri = "sim://single/plane?scale=0.03&rays=1&seed=2&layout=grid&ring=0.9"
+    assert run(["simulate", uri, "--out", str(tmp_path / "c")]) == 0
+    told = json.loads((tmp_path / "c" / "capture.json").read_text())
+    assert told["instrument"] == uri + "&noise=2"
+    assert told["projector"]["layout"] == "grid"
+    moved = world_of("sim://single/board?scale=0.03&pose=1&move=1,0,0#camera1")
+    assert moved.uri == "sim://single/board?scale=0.03&pose=1&move=1,0,0&noise=2"
+    there, here = (np.array(s.truth["poses.json"][0]["t"]) for s in (moved.scene, scene.make("board", pose=1)))
+    assert np.allclose(there - here, [1, 0, 0])
+    assert world_of("sim://single/plane?noise=0").uri == "sim://single/plane?noise=0"
+    capsys.readouterr()
+    assert run(["simulate", uri, "--preset", "pair", "--out", str(tmp_path / "e")]) == 2
+    assert "--preset" in capsys.readouterr().err
+    assert run(["simulate", "sim://single/plane?mov=1", "--out", str(tmp_path / "e")]) == 2
+    assert "unknown option 'mov'" in capsys.readouterr().err
+    assert not (tmp_path / "e").exists()
+
+
 def test_progress_off_a_terminal_tells_only_slow_stages(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress() as progress:
         assert list(progress.track([1, 2, 3], "quick", 3)) == [1, 2, 3]
         progress("slow", 0, 1)
         progress._begun["slow"] -= 2.0
         progress("slow", 1, 1)
+        progress("long", 0, 9)
+        progress._begun["long"] -= 11.0
+        progress("long", 7, 9)
+        progress("long", 8, 9)
     err = capsys.readouterr().err
     assert "slow: 2.0 s" in err
+    assert "long: 7 of 9" in err
+    assert "long: 8" not in err  # not again so soon
     assert "quick" not in err
     assert progress.times_s["slow"] > 2
 

@@ -282,6 +282,7 @@ def test_the_command(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert doc["before"] == json.loads((scans / "before" / "scan.json").read_text())["hash"]
     assert [g["id"] for g in doc["guidelines"]] == ["rim", "px"]
     assert doc["guidelines"][0]["median_mm"] < 0.5
+    assert any(w.startswith("rim: the cut ran ") for w in doc["words"])
     assert doc["specimen"]["before"]["found"]
     images = store.Images(out)
     depth = images.array("depth.tif")
@@ -354,7 +355,7 @@ def test_bad_pairs_are_refused_in_one_line(scans: Path, tmp_path: Path, capsys: 
         ((before, after, "--rig", other), 1, "the scans were made with"),
         ((before, tmp_path / "nothing"), 1, "not found"),
         ((newer, after), 1, "version 2 is higher"),
-        ((before, after, "--guidelines", before / "scan.json"), 1, '"strokes" is missing'),
+        ((before, after, "--guidelines", before / "scan.json"), 1, '"strokes" is null'),
     ):
         assert run(*args, "--out", out) == status
         err = capsys.readouterr().err
@@ -369,14 +370,19 @@ def test_bad_pairs_are_refused_in_one_line(scans: Path, tmp_path: Path, capsys: 
         ({"scan": "sha256:other"}, "another scan"),
         ({"rig": "sha256:other"}, "another rig"),
         ({"version": 2}, "version 2 is higher"),
-        ({"strokes": []}, "missing or empty"),
-        ({"strokes": [3]}, "needed an object"),
+        ({"strokes": None}, "needed a list"),
+        ({"strokes": []}, "there are no strokes"),
+        ({"strokes": [3]}, "has no id"),
         ({"strokes": [{"id": "a", "kind": "circle", "world_mm": [[1, 2, 3], [4, 5, 6]]}]}, "add --rig"),
-        ({"strokes": [{"id": "a"}]}, "no world_mm, pixels or segments"),
+        ({"strokes": [{"id": "a"}]}, "neither of pixels and world_mm"),
         ({"strokes": [{"id": "a", "pixels": [[1, 2]]}]}, "no camera"),
-        ({"strokes": [{"id": "a", "world_mm": [[1, 2]]}]}, "points of 3 finite numbers"),
-        ({"strokes": [{"id": "a", "world_mm": [[1, 2, float("nan")]]}]}, "points of 3 finite numbers"),
-        ({"strokes": [{"id": "a", "world_mm": "abc"}]}, "points of 3 finite numbers"),
+        ({"strokes": [{"id": "a", "world_mm": [[1, 2]]}]}, "one point of 3 numbers"),
+        ({"strokes": [{"id": "a", "world_mm": [[1, 2, float("nan")]]}]}, "NaN or infinite"),
+        ({"strokes": [{"id": "a", "world_mm": "abc"}]}, "needed a list of points"),
+        ({"format": "fringescope-pattern", "strokes": [{"id": "a", "segments": []}]}, "no part of it was shown"),
+        ({"format": "fringescope-pattern", "strokes": [{"id": "a", "segments": [], "refused": "black"}]}, "black"),
+        ({"format": "fringescope-pattern", "strokes": [{"id": "a", "segments": [[[1, 2], [3]]]}]}, "not numbers"),
+        ({"format": "fringescope-pattern", "version": 9}, "version 9 is higher"),
     ],
 )
 def test_bad_guidelines_are_refused(change: dict[str, object], said: str, tmp_path: Path) -> None:
@@ -384,10 +390,28 @@ def test_bad_guidelines_are_refused(change: dict[str, object], said: str, tmp_pa
             "strokes": [{"id": "a", "world_mm": [[1, 2, 3], [4, 5, 6]]}]}  # fmt: skip
     path = tmp_path / "g.json"
     path.write_text(json.dumps(good))
-    assert store.read_strokes(path, "sha256:a", "sha256:b")[0]["world_mm"].shape == (2, 3)
+    assert store.read_strokes(path, "sha256:a", "sha256:b")[0][0]["world_mm"].shape == (2, 3)
     path.write_text(json.dumps(good | change))
     with pytest.raises(FormatError, match=said):
         store.read_strokes(path, "sha256:a", "sha256:b")
+
+
+def test_without_a_rig_a_bad_stroke_costs_itself_alone(tmp_path: Path) -> None:
+    strokes = [
+        {"id": "a", "kind": "region", "world_mm": [[1, 2, 3], [4, 5, 6], [7, 8, 8]]},
+        {"id": "b", "camera": "camera1", "pixels": [[1, 2], [3, 4]], "color": "octarine"},
+        {"id": "c", "kind": "text", "text": "here", "camera": "camera1", "pixels": [[1, 2]]},
+        {"id": "a", "world_mm": [[1, 2, 3], [4, 5, 6]]},
+        {"id": "d", "camera": "camera1", "pixels": [[1, 2], [3, 4]]},
+        {"id": "e", "segments": [[[1, 2], [3, 4]]]},
+    ]
+    path = tmp_path / "g.json"
+    path.write_text(json.dumps({"format": "fringescope-guidelines", "version": 1, "strokes": strokes}))
+    drawn, refused = store.read_strokes(path, "sha256:a", None)
+    assert [(x["id"], x["closed"]) for x in drawn] == [("a", True), ("d", False), ("e", False)]
+    assert drawn[1]["camera"] == "camera1"
+    assert set(refused) == {"b", "c", "strokes[3]"}
+    assert "add --rig" in refused["c"]
 
 
 def test_surfaces_that_do_not_belong_together(cases: dict[str, Case]) -> None:

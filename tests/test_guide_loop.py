@@ -19,7 +19,7 @@ from fringescope.errors import DeviceError, DeviceLostError
 from fringescope.pipeline import closing, guidance, projecting, selftest, watching
 from fringescope.settings import Settings, from_dict
 from fringescope.twin import changes, optics, shapes
-from fringescope.types import Guidelines, Pose, Rig, Scan, Standing, Stroke, Watched
+from fringescope.types import Guidelines, Layout, Pose, Rig, Scan, Standing, Stroke, Watched
 from tests.guide_scenes import to_line
 
 S = Settings()
@@ -128,6 +128,9 @@ def test_a_dark_instrument_shows_no_line(domed: Any) -> None:
     assert found.share == 0
     with pytest.raises(DeviceError, match="the guidance is for"):
         closing.close_loop(replace(made, image=made.image[:100]), tissue, station, S)
+    grid = replace(tissue.rig.projector, layout=Layout.GRID, lens=replace(tissue.rig.projector.lens, width=912))
+    with pytest.raises(DeviceError, match="layout diamond; the guidance is for grid"):
+        closing.close_loop(made, replace(tissue, rig=replace(tissue.rig, projector=grid)), station, S)
     assert station.projector.shown is None
 
 

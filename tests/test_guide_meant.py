@@ -11,7 +11,7 @@ from fringescope import geometry, guide, store
 from fringescope.settings import Settings, from_dict
 from fringescope.types import Fill, Guidelines, Stroke, StrokeKind
 from tests import fuse_scenes
-from tests.guide_scenes import S, land, one, tissue, to_line
+from tests.guide_scenes import S, land, one, seen_by, tissue, to_line
 
 PLANE = fuse_scenes.plane()
 BALL = fuse_scenes.ball()
@@ -103,7 +103,7 @@ def test_letters_that_are_not_on_the_surface_are_not_drawn() -> None:
                     size_mm=5.0)  # fmt: skip
     g, image = one(stroke, t)
     assert 0.3 < g.visible < 0.95
-    assert any("of 6 letters are not wholly on visible surface" in n for n in g.notes)
+    assert any("of 6 letters are not wholly on visible, unbroken surface" in n for n in g.notes)
     spot = land(PLANE, t.rig.projector, lit(image))
     assert (np.abs(spot[:, 0] - 2) > 1.4).all()
     same_as_told(g, image)
@@ -113,6 +113,7 @@ def test_letters_that_are_not_on_the_surface_are_not_drawn() -> None:
 
 
 def test_no_letter_is_torn_by_a_step(on_step: guide.Tissue) -> None:
+    told = []
     for start in ([60, 50], [64, 70], [50, 40]):
         pixels = [start, [start[0] + 30, start[1] + 3]]
         stroke = Stroke("a", StrokeKind.TEXT, camera="camera1", pixels=pixels, text="HEHEHEHE", size_mm=3)
@@ -120,6 +121,34 @@ def test_no_letter_is_torn_by_a_step(on_step: guide.Tissue) -> None:
         if g.refused is None:
             same_as_told(g, image)
             assert all(np.linalg.norm(np.diff(p, axis=0), axis=1).max() < 0.6 for p in g.lands)
+            told += g.notes
+    assert any("(torn by a jump)" in n for n in told)
+
+
+@pytest.mark.parametrize("fill", list(Fill))
+def test_an_outline_that_crosses_itself_is_told(fill: Fill, on_plane: guide.Tissue) -> None:
+    a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    round_ = np.stack([100 + 20 * np.cos(a), 60 + 15 * np.sin(a)], 1)
+    for outline, crosses in (
+        (round_, False),
+        (np.vstack([round_, round_[:3] * 1.001]), False),  # the end runs over the start a little
+        (np.vstack([round_, 100 + 0.9 * (round_ - 100)]), True),
+        (np.array([[80, 50], [120, 70], [80, 70], [120, 50.0]]), True),
+    ):
+        stroke = Stroke("a", StrokeKind.REGION, camera="camera1", pixels=outline, fill=fill)
+        world = seen_by(PLANE, on_plane.rig.cameras[0], outline)
+        for x in (stroke, Stroke("a", StrokeKind.REGION, world_mm=world, fill=fill)):
+            g, image = one(x, on_plane)
+            assert g.refused is None, g.refused
+            assert image.any()
+            assert any("crosses itself" in n for n in g.notes) is crosses
+
+
+def test_progress_counts_the_strokes(on_plane: guide.Tissue) -> None:
+    seen: list[tuple[int, int]] = []
+    strokes = tuple(Stroke(str(i), camera="camera1", pixels=[[80, 50], [90 + i, 60]]) for i in range(3))
+    guide.guide(Guidelines(strokes), on_plane, S.guide, progress=lambda done, of: seen.append((done, of)))
+    assert seen == [(0, 3), (1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize("hit", [BALL, STEP])

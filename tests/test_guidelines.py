@@ -168,8 +168,10 @@ def test_the_verb_writes_picture_record_and_previews(
     kept = write(out.with_name("pattern.json"), strokes)  # guidelines are never replaced, whatever --force says
     assert call(scanned, kept, out, "--force") == 2
     assert json.loads(kept.read_text())["strokes"][0]["id"] == "cut-1"
-    # again: refused without --force, and nothing is lost
+    # again: refused without --force, before anything is projected, and nothing is lost
     before = out.read_bytes()
+    assert call(scanned, tmp_path / "g.json", out, "--verify", "--device", "sim://no/such") == 1
+    assert "--force" in capsys.readouterr().err
     assert call(scanned, tmp_path / "g.json", out) == 1
     assert "--force" in capsys.readouterr().err
     assert out.read_bytes() == before

@@ -120,7 +120,11 @@ def make_plan(world: World, s: Settings) -> PatternPlan:
 @app.command()
 def simulate(
     scene: Annotated[
-        str, typer.Argument(help="plane, sphere, steps, board, tissue-domed, tissue-folded or tissue-thin.")
+        str,
+        typer.Argument(
+            help="plane, sphere, steps, board, tissue-domed, tissue-folded or tissue-thin; or a whole URI, as "
+            "'sim://paper/tissue-thin?seed=3&move=1,0,0', which says all of it."
+        ),
     ],
     out: Out,
     preset: Annotated[str, typer.Option(help="Instrument: paper, single, pair or five.")] = "paper",
@@ -139,8 +143,15 @@ def simulate(
 ) -> None:
     """A capture of the simulated instrument, with its exact truth in truth/."""
     from fringescope import store
+    from fringescope.devices import simulated
 
     s = load_settings(settings, set_)
+    if scene.startswith("sim://"):
+        usual = {"preset": "paper", "scale": 0.125, "seed": 0, "layout": "diamond", "pose": 0, "board": "checkerboard"}
+        given = {"preset": preset, "scale": scale, "seed": seed, "layout": layout, "pose": pose, "board": board}
+        for name in usual:
+            if given[name] != usual[name]:
+                raise UsageError(f"--{name} {given[name]} with {scene}; a URI says all of it: put it there")
     if poses:
         if scene != "board":
             raise UsageError(f"--poses {poses} of {scene}; a session shows a board: simulate board --poses {poses}")
@@ -154,7 +165,10 @@ def simulate(
         emit(told, json, [f"{out}: a session of {poses} poses", f"rig: {out / 'truth' / 'rig.json'}"])
         return
     with Progress() as progress, store.new_folder(out, marker="capture.json", force=force) as tmp:
-        world = make_world(scene, preset, scale, seed, layout, pose, board)
+        if scene.startswith("sim://"):
+            world = simulated.parse(scene)
+        else:
+            world = make_world(scene, preset, scale, seed, layout, pose, board)
         simulate_into(tmp, world, make_plan(world, s), s, progress)
     c = store.read_capture(out)
     views = [{"camera": v.camera, "size": v.size, "frames": len(v.files)} for v in c.views]

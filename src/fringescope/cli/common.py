@@ -125,15 +125,19 @@ def emit(result: Mapping[str, Any], as_json: bool, lines: Iterable[str]) -> None
 
 
 class Progress:
-    """Progress on stderr: bars on a terminal, else a line when a stage that takes over a second has ended.
+    """Progress on stderr: bars on a terminal, else a line when a stage that takes over a second has ended, and one
+    every `TELL_S` seconds on how far a long stage has come.
 
     Call it with (stage, done, total) as work goes on. Use as a context manager.
     """
+
+    TELL_S = 10.0
 
     def __init__(self) -> None:
         self._bars: Bars | None = None
         self._tasks: dict[str, TaskID] = {}
         self._begun: dict[str, float] = {}
+        self._told: dict[str, float] = {}
         self._current = ""
         self.times_s: dict[str, float] = {}
 
@@ -161,10 +165,17 @@ class Progress:
             self.times_s[stage] = now - begun
             if self._bars is None and now - begun > 1:
                 say(f"{stage}: {now - begun:.1f} s")
+        elif self._bars is None and done > 0 and now - self._told.get(stage, begun) > self.TELL_S:
+            self._told[stage] = now
+            say(f"{stage}: {done:,.0f} of {total:,.0f}")
         if self._bars is not None:
             if stage not in self._tasks:
                 self._tasks[stage] = self._bars.add_task(stage, total=total)
             self._bars.update(self._tasks[stage], completed=done, total=total)
+
+    def of(self, stage: str) -> Callable[[int, int], None]:
+        """Tells this of one stage, for work that knows how much is done, of how much."""
+        return lambda done, total: self(stage, done, total)
 
     def _check(self) -> None:
         if INTERRUPTED.is_set():

@@ -62,8 +62,10 @@ def compare_into(
     r = None if rig is None else store.read_rig(rig)
     store.check_pair(scans[0], scans[1], None if rig is None else store.hash_rig(rig))
     first, second = (export.read_ply(x.cloud) for x in scans)
-    names, strokes, notes = _drawn(guidelines, scans[0], first, r, s) if guidelines is not None else ([], [], [])
-    c = comparing.compare_scans(first, second, r, s, moved=register, strokes=strokes, progress=progress.share)
+    names, strokes, notes = ([], [], []) if guidelines is None else _drawn(guidelines, scans[0], first, r, s)
+    c = comparing.compare_scans(
+        first, second, r, s, moved=register, strokes=strokes, names=names, progress=progress.share
+    )
     surface = None if scans[1].surface is None else export.read_glb(scans[1].surface)
     title = f"{before.resolve().name} to {after.resolve().name}"
     doc: dict[str, Any] = progress.run(
@@ -108,6 +110,7 @@ def _drawn(
         if not lines:
             raise FormatError(f"{guidelines}: nothing to compare the cut with; " + "; ".join(words[:3]))
         return names, lines, words
-    drawn = store.read_strokes(guidelines, *hashes)
+    drawn, refused = store.read_strokes(guidelines, *hashes)
     grids = store.read_scan(before.folder, check=False).grids if any("pixels" in x for x in drawn) else ()
-    return [x["id"] for x in drawn], comparing.world_strokes(drawn, cloud, grids, rig), []
+    words = [f"{k}: not compared: {v}" for k, v in refused.items()]
+    return [x["id"] for x in drawn], comparing.world_strokes(drawn, cloud, grids, rig), words

@@ -74,6 +74,8 @@ def guide(
     if record.exists() and record.samefile(guidelines):
         raise UsageError(f"{guidelines} would be replaced by the record, pattern.json; choose another folder for --out")
     store.check_replaced(record, force)
+    for path in (out, record):  # before anything is projected
+        store.check_new(path, force)
     with Progress() as progress:
         asked = store.read_guidelines(guidelines)
         stored = progress.run("reading the scan", lambda: store.read_scan(scan))
@@ -91,7 +93,10 @@ def guide(
         if stored.surface is None:
             raise EmptyResultError(f"{scan}: the scan has no surface, so nothing can be drawn on it; scan again")
         tissue = recipe.tissue_of(stored.grids, export.read_glb(stored.surface), r, s)
-        made = progress.run("strokes", lambda: recipe.project_guidance(asked, tissue, s, dashed=dashed))
+        made = recipe.project_guidance(asked, tissue, s, dashed=dashed, progress=progress.of("strokes"))
+        doubtful = made
+        if show is not None and not dashed:
+            doubtful = recipe.project_guidance(asked, tissue, s, dashed=True, progress=progress.of("dashed, in case"))
         pictures: dict[str, U8] = {}
         landings: Sequence[Landing] = ()
         if verify:
@@ -120,7 +125,7 @@ def guide(
     result: dict[str, Any] = {"pattern": str(out), **doc, "previews": {c: str(p) for c, p in beside.items()}}
     emit(result, json, [f"{out}: {len(made.strokes) + len(asked.refused)} strokes", *lines])
     if show is not None:
-        _project(uri, stored, tissue, made, recipe.project_guidance(asked, tissue, s, dashed=True), show, s)
+        _project(uri, stored, tissue, made, doubtful, show, s)
     far = [x for x in landings if x.p95_um is not None and x.p95_um > s.loop.accept_um]
     if far:
         raise GuidanceError(
@@ -137,12 +142,13 @@ def _project(
     """Shows guidance under a watchdog for `seconds`, or until Ctrl-C. Raises GuidanceError where it had to go dark."""
     from fringescope.devices import registry
     from fringescope.devices.watchdog import Guard
-    from fringescope.pipeline import projecting, watching
+    from fringescope.pipeline import closing, projecting, watching
 
     pictures, masks = stored.every_picture(), projecting.lit_masks(made, tissue)
     end = None if seconds <= 0 else time.monotonic() + seconds
 
     with until_interrupted() as interrupted, registry.open_station(uri) as station:
+        closing.check_device(made, tissue.rig, station)
 
         def stop() -> bool:
             return interrupted() or (end is not None and time.monotonic() > end)

@@ -263,7 +263,14 @@ def parse(uri: str) -> World:
     view = scene.make(name, seed, float(options["lift"]), int(options["pose"]), str(options["board"]))
     view = changes.changed(view, {k: str(options[k]) for k in changes.OPTIONS})
     noise_seed = seed + 1_000_000_007 * max(draw - 1, 0)
-    return World(view, instrument, noise_seed, draw > 0, rays=int(options["rays"]) or None)
+    uri = _again(u, draw + 1 if draw else 0)
+    return World(view, instrument, noise_seed, draw > 0, rays=int(options["rays"]) or None, uri=uri)
+
+
+def _again(u: urllib.parse.SplitResult, draw: int) -> str:
+    """A URI with this draw of noise, and without its fragment."""
+    options = dict(urllib.parse.parse_qsl(u.query)) | {"noise": str(draw)}
+    return f"sim://{u.netloc}{u.path}?" + "&".join(f"{k}={v}" for k, v in options.items())
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ the picture. The parts: `drape` (where is it on the tissue), `curves` and `fills
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -35,19 +36,30 @@ OVER = 0.05  #: of a stroke's picture that later ones may paint over without a w
 
 
 def guide(
-    guidelines: Guidelines, tissue: Tissue, s: GuideSettings, *, calibration_mm: float = 0.0, dashed: bool = False
+    guidelines: Guidelines,
+    tissue: Tissue,
+    s: GuideSettings,
+    *,
+    calibration_mm: float = 0.0,
+    dashed: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Guidance:
     """Strokes to the picture that the projector shows, and what became of each.
 
     `calibration_mm`: what the rig may be wrong by, on the tissue. `dashed`: they are in doubt. A stroke that cannot be
-    shown as it was asked for is refused with the reason, and the others are shown.
+    shown as it was asked for is refused with the reason, and the others are shown. `progress` is told how many strokes
+    are done, of how many.
     """
     canvas = Canvas(tissue.rig.projector)
     out = []
-    for stroke in guidelines.strokes:
+    for done, stroke in enumerate(guidelines.strokes):
+        if progress is not None:
+            progress(done, len(guidelines.strokes))
         made, patches = place(stroke, tissue, s, calibration_mm)
         canvas.stroke(made, patches, s, dashed)
         out.append(made)
+    if progress is not None:
+        progress(len(out), len(out))
     for i, lost in enumerate(canvas.painted_over()):
         if lost > OVER:
             out[i] = replace(out[i], notes=(*out[i].notes, f"later strokes paint over {lost:.0%} of it"))
@@ -98,6 +110,8 @@ def _place(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: flo
         inside = _inside(t, disc, stroke, tissue, s)
         size, more = _size(inside, line, t, tissue)
         notes += more
+        if disc is None and fills.crosses_itself(t.uv if stroke.pixels is None else stroke.pixels):
+            notes += ("its outline crosses itself: what it goes round twice counts as outside",)
         if inside is not None and stroke.fill is Fill.SOLID:
             patches.append(fills.lit(inside.share, inside.low, tissue.rig.projector, tissue.relief))
         elif inside is not None and stroke.fill is Fill.HATCH:
@@ -108,9 +122,10 @@ def _place(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: flo
 
 
 def _nowhere(line: Samples, stroke: Stroke) -> str:
+    what = "none of its outline" if stroke.closed or stroke.kind is StrokeKind.REGION else "none of it"
     if stroke.pixels is not None:
-        return f"none of it lies where the tissue was measured, as {stroke.camera} sees it; draw it on the tissue"
-    return "none of it lies on the measured surface; " + ("; ".join(line.notes) or "draw it on the tissue")
+        return f"{what} lies where the tissue was measured, as {stroke.camera} sees it; draw it on the tissue"
+    return f"{what} lies on the measured surface; " + ("; ".join(line.notes) or "draw it on the tissue")
 
 
 def _inside(
@@ -149,9 +164,11 @@ def _text(stroke: Stroke, tissue: Tissue, s: GuideSettings, calibration_mm: floa
     notes: tuple[str, ...] = ()
     if dark:
         names = [c for c in stroke.text if not c.isspace()]
-        which = ", ".join(repr(n) for n, x in zip(names, made, strict=True) if x.why) if len(names) == len(made) else ""
-        told = f"{len(dark)} of {len(made)} letters are not wholly on visible surface and are not drawn"
-        notes = (f"{told}: {which}" if which else told,)
+        named = [repr(n) + " " for n in names] if len(names) == len(made) else [""] * len(made)
+        which = ", ".join(f"{n}({x.reason})" for n, x in zip(named, made, strict=True) if x.why)
+        are = "is" if len(dark) == 1 else "are"
+        told = f"{len(dark)} of {len(made)} letters {are} not wholly on visible, unbroken surface and {are} not drawn"
+        notes = (f"{told}: {which}",)
     hidden = []
     for x in dark:
         assert x.why is not None

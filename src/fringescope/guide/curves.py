@@ -82,8 +82,8 @@ def circle(stroke: Stroke, tissue: Tissue, s: GuideSettings) -> tuple[Samples, D
     notes = [f"radius {radius:.2f} mm"]
     if (lost := float((~there[:-1]).mean())) >= 0.005:
         notes.append(f"{lost:.0%} of it is not reached along the surface, which jumps or ends before: not drawn there")
-    if jump.any():
-        notes.append(f"the surface jumps under it: it is broken in {int(jump.sum())} places")
+    if breaks := int(jump.sum()):
+        notes.append(f"the surface jumps under it: it is broken in {breaks} place{'' if breaks == 1 else 's'}")
     whole = np.logical_and.accumulate(walks[:, 1:] & walks[:, :-1] & beside, axis=0)
     return on_surface(rim, there, piece, tuple(notes)), Disc(ways, whole)
 

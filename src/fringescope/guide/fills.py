@@ -17,6 +17,7 @@ from fringescope.types import F32, F64, Layout, Projector
 
 FINE = 4  #: samples along each side of a unit
 BITS = 4  #: fractions of a pixel in OpenCV's coordinates
+CHECKED = 512  #: pixels along the longer side of an outline that is asked whether it crosses itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,27 @@ def inside(rings: Sequence[F64], low: Any, size: tuple[int, int], union: bool = 
     for some in ([x] for x in scaled) if union else (scaled,):
         cv2.fillPoly(fine, some, 1, cv2.LINE_8, BITS)
     return np.asarray(cv2.resize(fine.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA), np.float32)
+
+
+def crosses_itself(ring: F64) -> bool:
+    """Whether a closed polygon (n, 2) goes round a part of what it encloses twice, or the other way round.
+
+    Then its area by its corners is not that of what is inside; slips of less than 2 % do not count. NaN is left out.
+    """
+    p = ring[np.isfinite(ring).all(1)]
+    if len(p) < 3:
+        return False
+    low, size = p.min(0), float(np.ptp(p, axis=0).max())
+    if size == 0.0:
+        return False
+    q = (p - low) * (CHECKED / size) + 1
+    mask = np.zeros((CHECKED + 3, CHECKED + 3), np.uint8)
+    cv2.fillPoly(mask, [np.round(q * (1 << BITS)).astype(np.int32)], 1, cv2.LINE_8, BITS)
+    after = np.roll(q, -1, 0)
+    corners = 0.5 * abs(float((q[:, 0] * after[:, 1] - q[:, 1] * after[:, 0]).sum()))
+    around = float(np.linalg.norm(after - q, axis=1).sum())  # its pixels count as inside, half of each wrongly
+    filled = float(np.count_nonzero(mask))
+    return abs(corners - filled) > 0.02 * max(corners, filled) + around
 
 
 def lit(share: F32, low: Any, projector: Projector, relief: Relief) -> Patch:

@@ -12,10 +12,10 @@ from fringescope import geometry
 from fringescope.errors import GuidanceError
 from fringescope.guide import fills
 from fringescope.guide.drape import Source, in_shadow, places, resampled, seen
-from fringescope.guide.inside import window
+from fringescope.guide.inside import STEEP, window
 from fringescope.guide.tissue import Tissue
 from fringescope.settings import GuideSettings
-from fringescope.types import F64, Camera, Hidden, Projector, Stroke
+from fringescope.types import F32, F64, Camera, Hidden, Projector, Stroke
 
 FONT = "DejaVu Sans"  #: comes with matplotlib: the same letters everywhere
 LEAN_DEG = 60.0  #: the plane of the letters leans no more than this against the projector's rays
@@ -27,13 +27,20 @@ EDGE_SHARE = 0.02  #: of a letter may have no surface: specks, and what is cut f
 class Letter:
     """One letter: its outlines on the tissue, each (n, 3) mm, and on the projector's plane (n, 2), closed.
 
-    `why` it is not shown: None where all of it lies on surface that the projector lights.
+    `why` it is not shown: None where all of it lies on surface that the projector lights. `torn`: that is because the
+    surface jumps under it, which counts as a hole.
     """
 
     lands: tuple[F64, ...]
     rings: tuple[F64, ...]
     why: Hidden | None
     length_mm: float
+    torn: bool = False
+
+    @property
+    def reason(self) -> str:
+        """Why it is not shown, in a word or two."""
+        return "torn by a jump" if self.torn else self.why.value if self.why else ""
 
 
 def _without_a_letter(text: str) -> str:
@@ -159,14 +166,15 @@ def _letter(outlines: list[F64], start: F64, along: F64, up: F64, look: _Look) -
         rings.append(geometry.project(projector, np.where(np.isfinite(ground), ground, spot)))
         flat += float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())
     why = _why_not(rings, lands, np.concatenate(who), look.tissue, s)
+    torn = why in (None, Hidden.HOLE) and _torn(rings, lands, look.tissue, s)
     length = flat
-    if why is None:
+    if why is None and not torn:
         length = sum(float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in lands)
-    return Letter(tuple(lands), tuple(rings), why, length)
+    return Letter(tuple(lands), tuple(rings), Hidden.HOLE if torn else why, length, torn)
 
 
 def _why_not(rings: list[F64], lands: list[F64], source: Any, tissue: Tissue, s: GuideSettings) -> Hidden | None:
-    """Why a letter cannot be shown as a whole."""
+    """Why the projector cannot light all of a letter."""
     projector, relief = tissue.rig.projector, tissue.relief
     every, ground = np.concatenate(rings), np.concatenate(lands)
     w, h = projector.plane_size
@@ -175,24 +183,41 @@ def _why_not(rings: list[F64], lands: list[F64], source: Any, tissue: Tissue, s:
             return Hidden.OUTSIDE
     if not np.isfinite(ground).all():
         return Hidden.HOLE
-    low, size = window(every, projector)
-    part = (slice(low[1], low[1] + size[0]), slice(low[0], low[0] + size[1]))
-    share, depth = fills.inside(rings, low, size), relief.depth[part]
-    unit_mm = float(np.nanmedian(depth)) / float(projector.lens.K[0, 0])
+    share, depth = _under(rings, tissue)
     if share[~np.isfinite(depth)].sum() > EDGE_SHARE * share.sum():
         return Hidden.HOLE
     if in_shadow(ground, every, source, tissue, s).any():
         return Hidden.SHADOW
-    far = max(s.jump_mm, 4 * unit_mm)
-    if any((np.linalg.norm(np.diff(p, axis=0), axis=1) > far).any() for p in lands):
-        return Hidden.HOLE
-    depth = np.where(share > 0, depth, np.nan)
-    with np.errstate(invalid="ignore"):
-        if any((np.abs(np.diff(depth, axis=axis)) > far).any() for axis in (0, 1)):  # it would be torn apart
-            return Hidden.HOLE
     to_light = geometry.centre(projector.pose) - ground
     facing = (relief.of(relief.normal, every) * to_light).sum(1) / np.linalg.norm(to_light, axis=1)
     with np.errstate(invalid="ignore"):
         if (facing < math.cos(math.radians(s.grazing_deg))).any():
             return Hidden.GRAZING
     return None
+
+
+def _under(rings: list[F64], tissue: Tissue) -> tuple[F32, F32]:
+    """Shares (h, w) of the units that a letter covers, and the depth of the surface there, NaN where there is none."""
+    low, size = window(np.concatenate(rings), tissue.rig.projector)
+    part = (slice(low[1], low[1] + size[0]), slice(low[0], low[0] + size[1]))
+    return fills.inside(rings, low, size), tissue.relief.depth[part]
+
+
+def _torn(rings: list[F64], lands: list[F64], tissue: Tissue, s: GuideSettings) -> bool:
+    """Whether the surface jumps under a letter, there or over a hole that slopes do not explain."""
+    share, depth = _under(rings, tissue)
+    projector = tissue.rig.projector
+    if not np.isfinite(depth).any():
+        return False
+    unit_mm = float(np.nanmedian(depth)) / float(projector.lens.K[0, 0])
+    far = max(s.jump_mm, 4 * unit_mm)
+    for ring, land in zip(rings, lands, strict=True):
+        known = np.isfinite(land).all(1)
+        if (np.linalg.norm(np.diff(land, axis=0), axis=1) > far).any():
+            return True
+        aside = unit_mm * np.linalg.norm(np.diff(ring[known], axis=0), axis=1)
+        if (np.abs(np.diff(geometry.transform(projector.pose, land[known])[:, 2])) > far + STEEP * aside).any():
+            return True
+    depth = np.where(share > 0, depth, np.nan)
+    with np.errstate(invalid="ignore"):
+        return any(bool((np.abs(np.diff(depth, axis=axis)) > far).any()) for axis in (0, 1))

@@ -42,7 +42,12 @@ def relief(first, last, screen, faces, depth):
                         depth[v, u] = z
 
 
-@by_rows(lambda _xyz, _reasons, _sigma, pixels, *_: pixels.shape[0])
+@by_rows(
+    lambda _xyz, _reasons, _sigma, pixels, _origin, _rays, half, *_: (
+        pixels.shape[0],
+        pixels.shape[0] * (2 * half + 1) ** 2,
+    )
+)
 def drape(first, last, xyz, reasons, sigma, pixels, origin, rays, half, slope, lit, places, errors):
     """Places of a picture on the surface that its camera measured: on their own rays, at the range of a local plane.
 

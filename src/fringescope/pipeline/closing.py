@@ -33,13 +33,11 @@ def close_loop(guidance: Guidance, tissue: guide.Tissue, station: Station, setti
     Raises what devices raise, and DeviceError where the instrument lacks a camera of the scan or shows other pictures.
     """
     s = settings or Settings()
-    i = station.projector.info
-    if guidance.image.shape[:2] != (i.height, i.width):
-        h, w = guidance.image.shape[:2]
-        raise DeviceError(f"{i.uri} shows {i.width} x {i.height}; the guidance is for {w} x {h}: use the rig's device")
+    check_device(guidance, tissue.rig, station)
     cameras = cameras_of(station, tissue.rig, [g.camera for g in tissue.grids])
     formats = [c.settings.pixel_format for c in cameras]
     image = guidance.image
+    i = station.projector.info
     if not i.colours or bool((np.ptp(image, axis=2) == 0).all()):
         image = np.asarray(image.max(axis=2))  # grey
     taken = []
@@ -56,6 +54,17 @@ def close_loop(guidance: Guidance, tissue: guide.Tissue, station: Station, setti
         guide.Shots(g.camera, f, *frames) for g, f, *frames in zip(tissue.grids, formats, *taken, strict=True)
     )
     return Closed(guide.landings(guidance, shots, tissue, s.loop), shots)
+
+
+def check_device(guidance: Guidance, rig: Rig, station: Station) -> None:
+    """Raises DeviceError where an instrument's projector is not that of the rig: its mirrors are others."""
+    i, ours = station.projector.info, rig.projector.layout
+    if guidance.image.shape[:2] != (i.height, i.width):
+        h, w = guidance.image.shape[:2]
+        raise DeviceError(f"{i.uri} shows {i.width} x {i.height}; the guidance is for {w} x {h}: use the rig's device")
+    if i.layout is not ours:
+        has, needed = i.layout.value, ours.value
+        raise DeviceError(f"{i.uri} has the layout {has}; the guidance is for {needed}: use the rig's device")
 
 
 def cameras_of(station: Station, rig: Rig, names: Sequence[str]) -> list[Camera]:

@@ -40,11 +40,13 @@ def compare_scans(
     *,
     moved: bool = True,
     strokes: Sequence[F64] = (),
+    names: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Comparison:
     """What changed from one cloud to another of the same instrument; how far the cut ran from `strokes` (m, 3).
 
-    `moved` False: the specimen stayed where it was, nothing is registered. Strokes lie in the first scan's world.
+    `moved` False: the specimen stayed where it was, nothing is registered. Strokes lie in the first scan's world;
+    `names` are theirs, for words.
     Raises RegistrationError where the surfaces do not fit each other, EmptyResultError where points are too few.
     """
     s = settings or Settings()
@@ -74,7 +76,7 @@ def compare_scans(
         carried.append(there)
         errors.append(float(np.nanmedian(error)) if ok.any() else math.nan)
     distances = compare.from_guideline(change.cut, carried) if carried else ()
-    words = [*change.words, *_moved_words(placed, moved), *_guide_words(distances, change)]
+    words = [*change.words, *_moved_words(placed, moved), *_guide_words(distances, change, names)]
     if not grounded:
         words.append("the specimen is not told from its substrate (" + (found[0].why or found[1].why)
                      + "): all that both scans hold was compared")  # fmt: skip
@@ -121,21 +123,24 @@ def _moved_words(r: register.Registration, moved: bool) -> list[str]:
     return [line, *r.words] + ([] if r.converged else ["the registration did not settle; mistrust small changes"])
 
 
-def _guide_words(distances: Sequence[compare.FromGuideline], change: compare.Change) -> list[str]:
+def _guide_words(
+    distances: Sequence[compare.FromGuideline], change: compare.Change, names: Sequence[str]
+) -> list[str]:
     out = []
     for d in distances:
+        name = names[d.stroke] if d.stroke < len(names) else f"stroke {d.stroke + 1}"
         if not len(change.cut):
-            out.append(f"stroke {d.stroke + 1}: nothing was cut")
+            out.append(f"{name}: nothing was cut")
         elif d.points:
             line = (
-                f"stroke {d.stroke + 1}: the cut ran {d.median_mm:.2f} mm from it (median), p95 {d.p95_mm:.2f}, "
+                f"{name}: the cut ran {d.median_mm:.2f} mm from it (median), p95 {d.p95_mm:.2f}, "
                 f"at most {d.max_mm:.2f}"
             )
             if d.missed > 0.02:
                 line += f"; {100 * d.missed:.0f} % of it was not cut"
             out.append(line)
         else:
-            out.append(f"stroke {d.stroke + 1}: no cut is nearest to it")
+            out.append(f"{name}: no cut is nearest to it")
     return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from fringescope import fuse, geometry, guide, report
 from fringescope.errors import GuidanceError
@@ -17,14 +17,21 @@ def tissue_of(grids: Sequence[Grid], surface: Surface | None, rig: Rig, s: Setti
 
 
 def project_guidance(
-    guidelines: Guidelines, tissue: guide.Tissue, settings: Settings | None = None, *, dashed: bool = False
+    guidelines: Guidelines,
+    tissue: guide.Tissue,
+    settings: Settings | None = None,
+    *,
+    dashed: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Guidance:
     """Strokes to the device's picture, and what became of each: a stroke that cannot be shown says why (`refused`).
 
-    `dashed` draws them in dashes: whether they are still true is in doubt.
+    `dashed` draws them in dashes: whether they are still true is in doubt. `progress` is told how many strokes are
+    done, of how many.
     """
     s = settings or Settings()
-    return guide.guide(guidelines, tissue, s.guide, calibration_mm=calibration_mm(tissue.rig), dashed=dashed)
+    mm = calibration_mm(tissue.rig)
+    return guide.guide(guidelines, tissue, s.guide, calibration_mm=mm, dashed=dashed, progress=progress)
 
 
 def check_bound(guidelines: Guidelines, scan: str, rig: str) -> None:

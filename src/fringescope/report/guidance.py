@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import cv2
 import numpy as np
 
@@ -10,6 +12,7 @@ from fringescope.types import F32, F64, U8, AnyArray, Camera, Guidance, Guided, 
 
 WIDE = 1400  #: pixels of a preview at most
 LINE = 26  #: height of a line of its caption
+ROWS = 3  #: lines of the caption that one stroke may take
 HIDDEN_COLOUR = (255, 176, 0)
 GAIN = 3.0  #: how much brighter than the ring light the lamps of the projector look
 
@@ -98,7 +101,7 @@ def landing_picture(photo: F32, camera: Camera, index: int, landings: tuple[Land
                 _line(out, q, q + times * (p - q), (255, 64, 64), 1)
                 cv2.circle(out, (round(p[0] * 16), round(p[1] * 16)), 24, (64, 255, 96), -1, cv2.LINE_AA, 4)
         lines.append(f"{one.id}: {landing_caption(one)}")
-    return _captioned(out, [*lines, f"red: offset, {times} times as large"])
+    return _captioned(out, [f"red: offset, {times} times as large", *lines])
 
 
 def _srgb(light: AnyArray) -> U8:
@@ -125,12 +128,14 @@ def _line(out: U8, a: F64, b: F64, colour: tuple[int, int, int], wide: int) -> N
 
 
 def _captioned(picture: U8, lines: list[str], most: int = 12) -> U8:
-    """The picture with lines of words under it."""
+    """The picture with lines of words under it; long ones go on, indented, on the next line."""
     shown = lines[:most] + ([f"and {len(lines) - most} more"] if len(lines) > most else [])
-    strip = np.full((LINE * len(shown) + 10, picture.shape[1], 3), 24, np.uint8)
-    for i, words in enumerate(shown):
+    room = max(10, int((picture.shape[1] - 20) / 9.2))
+    rows: list[str] = []
+    for words in shown:
         plain = words.encode("ascii", "replace").decode()
-        room = max(10, int((picture.shape[1] - 20) / 9.2))
-        plain = plain if len(plain) <= room else plain[: room - 2] + ".."
-        cv2.putText(strip, plain, (10, LINE * (i + 1)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235, 235, 235), 1, cv2.LINE_AA)
+        rows += textwrap.wrap(plain, room, subsequent_indent="    ", max_lines=ROWS, placeholder=" ..")
+    strip = np.full((LINE * len(rows) + 10, picture.shape[1], 3), 24, np.uint8)
+    for i, row in enumerate(rows):
+        cv2.putText(strip, row, (10, LINE * (i + 1)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235, 235, 235), 1, cv2.LINE_AA)
     return np.vstack([picture, strip])

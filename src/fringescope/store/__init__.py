@@ -12,8 +12,8 @@ from fringescope.store.capture import (
     view_inputs,
     write_capture,
 )
-from fringescope.store.comparison import check_pair, put_comparison, read_strokes
-from fringescope.store.files import new_file, new_folder, write_json
+from fringescope.store.comparison import check_pair, put_comparison
+from fringescope.store.files import check_new, new_file, new_folder, write_json
 from fringescope.store.guidelines import (
     check_replaced,
     check_stroke,
@@ -22,6 +22,7 @@ from fringescope.store.guidelines import (
     parse_guidelines,
     pattern_document,
     read_guidelines,
+    read_strokes,
 )
 from fringescope.store.images import Images, write_png, write_tiff
 from fringescope.store.response import read_response, response_document
@@ -56,6 +57,7 @@ __all__ = [
     "StoredScan",
     "board_document",
     "calibration_document",
+    "check_new",
     "check_pair",
     "check_replaced",
     "check_rig",

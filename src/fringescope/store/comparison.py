@@ -1,4 +1,4 @@
-"""A comparison's folder: compare.json, the maps as TIFF, the coloured surface; and strokes read from guideline files.
+"""A comparison's folder: compare.json, the maps as TIFF, the coloured surface.
 
 The PLY and GLB writers are handed in (`export.write_ply`, `export.write_glb`): files know data, not each other.
 """
@@ -6,7 +6,6 @@ The PLY and GLB writers are handed in (`export.write_ply`, `export.write_glb`): 
 from __future__ import annotations
 
 import datetime
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from fringescope.store.scan import StoredScan, WriteGlb, WritePly, plain, sha256
 from fringescope.types import F64, U8, AnyArray, Cloud, Surface
 
 FORMAT, VERSION = "fringescope-comparison", 1
-_MOST = 2_000_000  #: points of all strokes together
 
 
 def check_pair(before: StoredScan, after: StoredScan, rig_hash: str | None = None) -> None:
@@ -90,55 +88,3 @@ def put_comparison(
     }
     files.write_json(folder / files.COMPARISON, doc)
     return doc
-
-
-def read_strokes(path: Path | str, scan_hash: str | None, rig_hash: str | None) -> list[dict[str, Any]]:
-    """The strokes of a guidelines file, or of a pattern.json: dictionaries with "id" and one of "world_mm" (m, 3),
-    "pixels" (m, 2) with "camera", or "segments" (k of (m, 2)) on the projector's plane; and "closed".
-
-    Raises FormatError for another scan or rig than given, for a stroke that has none of these, or no finite numbers.
-    """
-    path = Path(path)
-    doc = files.read_json(path, "guidelines or a pattern.json")
-    if "format" in doc and doc["format"] == "fringescope-guidelines":
-        files.check_format(doc, path, "fringescope-guidelines", 1)
-    for key, ours in (("scan", scan_hash), ("rig", rig_hash)):
-        if isinstance(doc.get(key), str) and ours is not None and doc[key] != ours:
-            raise FormatError(f"{path}: drawn on another {key} ({doc[key][:24]}..); needed that of the scan before")
-    strokes = doc.get("strokes")
-    if not isinstance(strokes, list) or not strokes:
-        raise FormatError(f'{path}: "strokes" is missing or empty; needed a list of strokes')
-    out, total = [], 0
-    for n, one in enumerate(strokes):
-        if not isinstance(one, dict):
-            raise FormatError(f"{path}: stroke {n + 1} is {files.shown(one)}; needed an object")
-        name = str(one.get("id", n + 1))[:80]
-        if one.get("kind", "line") not in ("line", "region", "arrow") and "segments" not in one:
-            kind = files.shown(one.get("kind"))
-            raise FormatError(f"{path}: stroke '{name}' is of the kind {kind}; add --rig rig.json, which draws it")
-        stroke: dict[str, Any] = {"id": name, "closed": one.get("closed") is True or one.get("kind") == "region"}
-        if "world_mm" in one:
-            stroke["world_mm"] = _points(one["world_mm"], 3, path, name)
-        elif "pixels" in one:
-            if not isinstance(one.get("camera"), str):
-                raise FormatError(f"{path}: stroke '{name}' has pixels but no camera; say which camera they belong to")
-            stroke |= {"pixels": _points(one["pixels"], 2, path, name), "camera": one["camera"]}
-        elif isinstance(one.get("segments"), list):
-            stroke["segments"] = [_points(x, 2, path, name) for x in one["segments"]]
-        else:
-            raise FormatError(f"{path}: stroke '{name}' has no world_mm, pixels or segments; needed one of them")
-        total += sum(len(x) for x in stroke.get("segments", [stroke.get("world_mm", stroke.get("pixels"))]))
-        out.append(stroke)
-    if total > _MOST:
-        raise FormatError(f"{path}: {total} points; needed at most {_MOST} in all strokes")
-    return out
-
-
-def _points(value: Any, columns: int, path: Path, name: str) -> F64:
-    try:
-        a = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        a = np.zeros(0)
-    if a.ndim != 2 or a.shape[1] != columns or len(a) < 1 or not all(math.isfinite(x) for x in (a.min(), a.max())):
-        raise FormatError(f"{path}: stroke '{name}': {files.shown(value)}; needed points of {columns} finite numbers")
-    return a

@@ -216,6 +216,14 @@ def _swap(work: Path, target: Path) -> None:
         _let_go(held)
 
 
+def check_new(path: Path, force: bool) -> None:
+    """Raises OutputError where a file may not be written: it is there, and `force` is not given, or it is a folder."""
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; needed the name of a file")
+    if os.path.lexists(path) and not force:
+        raise OutputError(f"{path}: exists; choose another name, or add --force to replace it")
+
+
 @contextmanager
 def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
     """A file that appears whole at the end of the block, or not at all.
@@ -224,10 +232,7 @@ def new_file(path: Path | str, *, force: bool = False) -> Iterator[Path]:
     file is replaced with `force`, a folder never), and for any OSError in the block.
     """
     path = Path(path)
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; needed the name of a file")
-    if os.path.lexists(path) and not force:
-        raise OutputError(f"{path}: exists; choose another name, or add --force to replace it")
+    check_new(path, force)
     try:
         target = path.resolve()
         if target.parent.is_dir():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -15,10 +15,14 @@ from fringescope.errors import FormatError, GuidanceError, OutputError
 from fringescope.store import files
 from fringescope.store.scan import plain
 from fringescope.types import Fill, Guidance, Guided, Guidelines, Landing, Side, Stroke, StrokeKind
+from fringescope.types.guidance import stroke_points
 
 FORMAT, VERSION = "fringescope-guidelines", 1
 PATTERN_FORMAT, PATTERN_VERSION = "fringescope-pattern", 1
 
+T = TypeVar("T")
+
+MOST_POINTS = 2_000_000  #: of all lines together that a cut is compared with
 NO_ID = "has no id (a word of printable letters); needed one"
 
 #: names of colours that a file may use beside #rrggbb
@@ -51,13 +55,26 @@ def is_guidelines(path: Path | str) -> bool:
 def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
     """As `read_guidelines`, of a JSON object; `path` names it in messages."""
     files.check_format(doc, path, FORMAT, VERSION)
-    listed = doc.get("strokes")
-    if not isinstance(listed, list):
-        raise FormatError(f'{path}: "strokes" is {files.shown(listed)}; needed a list of strokes')
+    listed = _listed(doc, path)
     for key in ("scan", "rig"):
         if not isinstance(doc.get(key), (str, type(None))):
             raise FormatError(f'{path}: "{key}" is {files.shown(doc[key])}; needed a hash ("sha256:..") or nothing')
-    strokes: list[Stroke] = []
+    strokes, refused = _each(listed, _stroke)
+    return Guidelines(tuple(strokes), doc.get("scan"), doc.get("rig"), refused)
+
+
+def _listed(doc: Mapping[str, Any], path: Path) -> list[Any]:
+    listed = doc.get("strokes")
+    if not isinstance(listed, list):
+        raise FormatError(f'{path}: "strokes" is {files.shown(listed)}; needed a list of strokes')
+    return listed
+
+
+def _each(listed: Sequence[Any], read: Callable[[str, Mapping[str, Any]], T]) -> tuple[list[T], dict[str, str]]:
+    """What `read` makes of each stroke of a file, and why it makes nothing of the others. Of two with one id the first
+    counts.
+    """
+    out: list[T] = []
     refused: dict[str, str] = {}
     seen: set[str] = set()
     for i, entry in enumerate(listed):
@@ -70,10 +87,55 @@ def parse_guidelines(doc: Mapping[str, Any], path: Path) -> Guidelines:
             continue
         seen.add(name)
         try:
-            strokes.append(_stroke(name, entry))
+            out.append(read(name, entry))
         except GuidanceError as e:
             refused[name] = str(e)
-    return Guidelines(tuple(strokes), doc.get("scan"), doc.get("rig"), refused)
+    return out, refused
+
+
+def read_strokes(
+    path: Path | str, scan_hash: str | None, rig_hash: str | None
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """The lines of a guidelines file, or of a pattern.json, that need no surface to be drawn on: dictionaries with "id"
+    and one of "world_mm" (m, 3), "pixels" (m, 2) with "camera", or "segments" (k of (m, 2)) on the projector's plane;
+    and "closed". With them, as of `read_guidelines`, the strokes that are refused, and why.
+
+    Raises FormatError for another scan or rig than given, and where no stroke is left.
+    """
+    path = Path(path)
+    doc = files.read_json(path, "guidelines or a pattern.json")
+    for form, version in ((FORMAT, VERSION), (PATTERN_FORMAT, PATTERN_VERSION)):
+        if doc.get("format") == form:
+            files.check_format(doc, path, form, version)
+    for key, ours in (("scan", scan_hash), ("rig", rig_hash)):
+        if isinstance(doc.get(key), str) and ours is not None and doc[key] != ours:
+            raise FormatError(f"{path}: drawn on another {key} ({doc[key][:24]}..); needed that of the scan before")
+    listed = _listed(doc, path)
+    out, refused = _each(listed, _plain_line)
+    if not out:
+        why = "; ".join(f"{k}: {v}" for k, v in list(refused.items())[:3])
+        raise FormatError(f"{path}: nothing to compare the cut with; {why or 'there are no strokes'}")
+    total = sum(len(x) for one in out for x in one.get("segments", [one.get("world_mm", one.get("pixels"))]))
+    if total > MOST_POINTS:
+        raise FormatError(f"{path}: {total} points; needed at most {MOST_POINTS} in all strokes")
+    return out, refused
+
+
+def _plain_line(name: str, d: Mapping[str, Any]) -> dict[str, Any]:
+    """A stroke as a line. Raises GuidanceError for one that is more than the line through its points."""
+    if isinstance(d.get("refused"), str):  # a record of what was not shown
+        raise GuidanceError(f"was not shown: {d['refused']}")
+    if isinstance(d.get("segments"), list):
+        if not d["segments"]:
+            raise GuidanceError("no part of it was shown")
+        return {"id": name, "closed": False, "segments": [stroke_points(x, "segments", 2) for x in d["segments"]]}
+    stroke = _stroke(name, d)
+    if stroke.kind in (StrokeKind.CIRCLE, StrokeKind.OFFSETS, StrokeKind.TEXT):
+        raise GuidanceError(f"is of the kind {stroke.kind.value}; add --rig rig.json, which draws it")
+    line: dict[str, Any] = {"id": name, "closed": stroke.closed or stroke.kind is StrokeKind.REGION}
+    if stroke.pixels is not None:
+        return {**line, "pixels": stroke.pixels, "camera": stroke.camera}
+    return {**line, "world_mm": stroke.points}
 
 
 def check_stroke(entry: Mapping[str, Any]) -> Stroke:

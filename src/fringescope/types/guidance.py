@@ -89,7 +89,7 @@ class Stroke:
         if self.pixels is not None and not self.camera:
             raise GuidanceError("has pixels and no camera; needed the name of the camera that they belong to")
         name, n = ("pixels", 2) if self.pixels is not None else ("world_mm", 3)
-        points = _points(getattr(self, name), name, n)
+        points = stroke_points(getattr(self, name), name, n)
         object.__setattr__(self, name, points)
         if self.width_mm is not None and self.width_px is not None:
             raise GuidanceError("has both width_mm and width_px; needed one of them")
@@ -130,7 +130,8 @@ class Stroke:
         return points
 
 
-def _points(a: Any, name: str, n: int) -> F64:
+def stroke_points(a: Any, name: str, n: int) -> F64:
+    """A list of points as an array (m, n), read-only; `name` stands in messages. Raises GuidanceError."""
     try:
         raw = np.array(a)
     except (TypeError, ValueError, OverflowError):
