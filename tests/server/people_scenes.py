@@ -25,7 +25,8 @@ from tests.server.conftest import PASSWORD, populate
 from tests.server.test_hub import scanned
 
 WIDE = Limits(
-    logins_per_minute=100_000, requests_per_s=100_000, requests_burst=100_000, ops_per_s=1e5, ops_burst=10_000
+    logins_per_minute=100_000, requests_per_s=100_000, requests_burst=100_000, ops_per_s=1e5, ops_burst=10_000,
+    log_bytes_burst=10**9,
 )
 ROLES = ("stranger", "guest", "watcher", "observer", "expert", "operator", "admin")
 S = 1_000_000_000

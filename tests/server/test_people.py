@@ -375,11 +375,12 @@ def test_browsers_are_told_what_to_forbid(hub: Server) -> None:
 
 
 def test_too_many_tries_are_told_to_wait(hub: Server) -> None:
-    answers = [tried(hub, f"name-{k}", "wrong") for k in range(22)]
+    hub.site.logins._rate = 1e-3  # a busy machine tries slowly, and a third of a try a second would be forgiven
+    answers = [tried(hub, f"name-{k}", "wrong") for k in range(21)]
     assert [a.status_code for a in answers[:20]] == [401] * 20
-    assert answers[21].status_code == 429
-    assert int(answers[21].headers["retry-after"]) >= 1
-    assert "wait" in answers[21].json()["detail"]
+    assert answers[20].status_code == 429
+    assert int(answers[20].headers["retry-after"]) >= 1
+    assert "wait" in answers[20].json()["detail"]
     with httpx.Client(base_url=hub.url) as http:  # all ways in are one way
         body = {"token": "x", "code": "y"}
         assert http.post("/api/invitations/accept", json=body).status_code == 429

@@ -125,7 +125,10 @@ SAID: dict[str, tuple[str, dict[str, Any]]] = {
     "stop": (ALL, {}),
     "carry_over": ("", {"version": 1, "scan": SCAN, "job": "job-1"}),  # by its own route alone
 }
-LOCAL = ("arm", "start", "acknowledge")
+LOCAL = ("preview", "arm", "start", "acknowledge")
+#: what belongs to who stands at the instrument, beside these words: whatever projects, or moves what lies there
+AT_THE_INSTRUMENT = ("POST /api/cases/{case}/scans", "POST /api/instrument/poses", "POST /api/instrument/calibrate",
+                     "POST /api/instrument/simulate")  # fmt: skip
 LIVE: dict[str, tuple[str, dict[str, Any]]] = {
     "pointer": (TALK, {"camera": "camera1", "pixel": [1, 2]}),
     "view": (TALK, {"eye_mm": [0, 0, 1], "target_mm": [0, 0, 0], "up": [0, 1, 0]}),
@@ -320,6 +323,11 @@ def refused_from_afar(client: Client, case: str, **headers: str) -> None:
     """That nothing that belongs to who stands at the instrument is taken from this client."""
     me = asked(client, "GET", "/api/me", **headers).json()
     assert me["local"] is False, headers
+    for route in AT_THE_INSTRUMENT:
+        method, path = route.split()
+        answer = asked(client, method, path.replace("{case}", case), ROUTES[route].body, **headers)
+        assert (answer.status_code, "at the instrument; from afar" in answer.text) == (403, True), (route, answer.text)
+    assert asked(client, "POST", "/api/instrument/stop", **headers).status_code == 200
     with room_of(client, case, **headers) as room:
         assert heard(room, "welcome")["local"] is False
         for kind in LOCAL:

@@ -21,6 +21,8 @@ class Limits:
     upload_bytes: int = 16_000_000_000  #: longest bundle: a scan of full size has about 2 GB
     ops_per_s: float = 40.0  #: ops of one connection, on average
     ops_burst: int = 400  #: and at once, as after a time offline
+    log_bytes_per_s: float = 20_000.0  #: what one person writes into the logs, on average: 1.7 GB a day at most
+    log_bytes_burst: int = 8_000_000  #: and at once
     live_per_s: float = 120.0  #: pointers, views and ink of one connection
     requests_per_s: float = 100.0  #: requests of one address
     requests_burst: int = 500
@@ -36,6 +38,10 @@ class Limits:
     waiting_letters: int = 16_000_000  #: and how long they may be together
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
+    videos_each: int = 10  #: of one person: two pages with all cameras
+    connections: int = 2000  #: open connections from other machines
+    connections_each: int = 500  #: of one address
+    body_s: float = 30.0  #: a body may pause for so long, and has 1 kB a second on average after that
 
 
 @dataclass(frozen=True)

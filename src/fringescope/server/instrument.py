@@ -11,6 +11,7 @@ import base64
 import contextlib
 import json
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ from fringescope.wire.documents import InstrumentState
 _BEAT_S = 0.1
 _TELL_S = 1.5  #: a verdict that is like the one before is written down so often
 _DARK_S = 0.04  #: the stop button is pressed if the process does not say in this time that it is dark
+_BEFALLS = ("move", "turn", "dent", "dry", "ring", "cover", "scene", "pose", "board")
 _IDLE_S = 600.0  #: the watchdog rests when nothing was projected for so long
 
 
@@ -67,7 +69,7 @@ class Instrument:
         self._why = ""
         self._open = False
         self._cameras: tuple[str, ...] = ()
-        self.watching = 0  #: streams of video
+        self.watching: Counter[str] = Counter()  #: streams of video, by who watches
         self._hand = asyncio.Lock()  #: one thing at a time is done with the devices
         hub.carry_out = self.carry_out
         hub.dark = self.dark
@@ -376,6 +378,8 @@ class Instrument:
         return bool(await self._devices.call("shown"))
 
     async def befall(self, what: dict[str, str]) -> None:
-        """For the simulated instrument: something happens to the specimen."""
+        """For the simulated instrument: something happens to the specimen. Raises UsageError for what cannot."""
+        if unknown := sorted(set(what) - set(_BEFALLS)):
+            raise UsageError(f"{unknown[0][:40]!r} befalls no specimen; needed some of {', '.join(_BEFALLS)}")
         await self.open()
         await self._devices.call("befall", what=what)

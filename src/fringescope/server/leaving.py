@@ -245,7 +245,7 @@ class Leaving:
         try:
             return await self._packer.call(name, tell, **args)
         except asyncio.CancelledError:
-            await self._packer.kill()
+            await asyncio.shield(self._packer.restart())
             raise
 
     def _unpack_scan(self, file: Path, to: Path) -> Path:

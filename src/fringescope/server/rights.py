@@ -45,6 +45,7 @@ MAY: dict[str, frozenset[PersonRole]] = {
     # the instrument
     "scan.take": frozenset({OPERATOR}),
     "scan.add": frozenset({OPERATOR}),
+    "scan.compare": frozenset({OPERATOR}),
     "instrument.calibrate": frozenset({OPERATOR}),
     "instrument.read": frozenset({OPERATOR, EXPERT, OBSERVER, ADMIN}),
     "instrument.stop": EVERYBODY,
@@ -58,8 +59,8 @@ MAY: dict[str, frozenset[PersonRole]] = {
     "audit": frozenset({ADMIN}),
 }
 
-#: what only somebody at the instrument itself may say
-LOCAL = frozenset({"arm", "start", "acknowledge"})
+#: what only somebody at the instrument itself may do: all that projects, and the look that comes before it
+LOCAL = frozenset({"preview", "arm", "start", "acknowledge", "scan.take", "instrument.calibrate"})
 
 #: what needs the password once more, not long ago
 CONFIRMED = frozenset({"sign"})

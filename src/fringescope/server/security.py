@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import json
 import re
+import time
 from collections.abc import MutableMapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,6 +27,7 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
+_SLOWEST = 1000  #: bytes a second of a body, on average
 _SAFE = ("GET", "HEAD", "OPTIONS")
 _UPLOADS = re.compile(r"/api/cases/(import|[^/]+/scans/import)")
 _FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "x-cluster-client-ip", "true-client-ip", "cf-ray",
@@ -126,12 +129,20 @@ class Guarded:
             await _refuse(sent, 413, f"a body of {length[:20]} bytes; at most {longest} are taken")
             return
         count = 0
-        began = over = False
+        began = over = whole = False
+        since = time.monotonic()
 
         async def received() -> Message:
-            nonlocal count, over
-            message = await receive()
+            nonlocal count, over, whole
+            try:
+                message = await asyncio.wait_for(receive(), None if whole else limits.body_s)
+            except TimeoutError:
+                return {"type": "http.disconnect"}  # whoever reads the body hears that it ended
+            whole = whole or not message.get("more_body", False)
             count += len(message.get("body", b""))
+            late = time.monotonic() - since - limits.body_s
+            if not whole and late > 0 and count < _SLOWEST * late:
+                return {"type": "http.disconnect"}
             if count > longest:
                 over = True
                 raise _TooLongError

@@ -142,7 +142,7 @@ async def add_scan(
                 shutil.rmtree(file.parent, ignore_errors=True)
 
         try:
-            return who.site.jobs.begin("add scan", case, who.speaker.person, add)
+            return await who.site.jobs.begin("add scan", case, who.speaker.person, add)
         except UsageError as e:
             raise HTTPException(409, str(e)) from None
 
