@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import getpass
 import os
 import sys
@@ -91,7 +92,9 @@ def serve(
     server.check()
     running.first_admin(server.site, say)
     say(f"research use only; the hub listens at {server.url} (data in {data}); Ctrl-C ends it")
-    server.run()
+    with contextlib.suppress(KeyboardInterrupt):  # it has ended in good order by then
+        server.run()
+    say("the hub has ended; all of it is in its folder")
 
 
 def _secret(file: Path | None) -> str:
