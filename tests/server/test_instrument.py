@@ -246,6 +246,13 @@ def test_a_specimen_that_moves_makes_dark(operator: Client, room: Room) -> None:
     assert len(mine) == len(result["strokes"]) >= 1
 
 
+def test_what_befalls_no_specimen_is_said(operator: Client) -> None:
+    for what, why in (({"cut": "1"}, "befalls no specimen; needed some of move, turn"), ({"move": "x"}, "move")):
+        with pytest.raises(HubError, match=why) as e:
+            operator.befall(**what)
+        assert e.value.status in (400, 409)
+
+
 def test_a_scan_can_be_cancelled_and_leaves_nothing(case: HubCase, operator: Client) -> None:
     before = len(case.scans())
     job = case.scan("unwanted", wait=False)

@@ -92,6 +92,7 @@ class Config:
     key: Path | None = None
     origins: tuple[str, ...] = ()  #: further origins of pages that may talk to it, as https://hub.hospital.example
     behind_proxy: bool = False  #: another server hands requests on: nobody is local by their address alone
+    local_port: int | None = None  #: behind a proxy: a port of this machine alone, for who stands at the instrument
     settings: Settings = field(default_factory=Settings)
     limits: Limits = Limits()
     provider: Provider | None = None
@@ -102,6 +103,8 @@ class Config:
             raise UsageError("--oidc-issuer needs --origin: where the provider sends people back to")
         if (self.certificate is None) != (self.key is None):
             raise UsageError("--certificate and --key belong together; give both, or --self-signed")
+        if self.local_port is not None and not self.behind_proxy:
+            raise UsageError("--local-port is for a hub --behind-proxy; without one its own port is local already")
         if self.host not in LOOPBACK and self.certificate is None:
             raise UsageError(
                 f"--host {self.host}: others could listen in; needed a certificate and its key (--certificate, --key), "
@@ -128,5 +131,7 @@ class Config:
         """Origins of its own pages."""
         scheme = "https" if self.tls else "http"
         names = {self.host, *(LOOPBACK if self.host in LOOPBACK else ())} - {"0.0.0.0", "::"}
-        hosts = [f"[{n}]" if ":" in n else n for n in sorted(names)]
-        return (*(f"{scheme}://{n}:{self.port}" for n in hosts), *self.origins)
+        pages = [(n, self.port) for n in sorted(names)]
+        if self.local_port is not None:
+            pages += [(n, self.local_port) for n in LOOPBACK]
+        return (*(f"{scheme}://{f'[{n}]' if ':' in n else n}:{port}" for n, port in pages), *self.origins)

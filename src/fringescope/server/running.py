@@ -38,16 +38,27 @@ class Server:
         import argon2
 
         self._socket = _bind(config)
-        port = self._socket.getsockname()[1]
-        self.config = replace(config, port=port)
+        self._sockets = [self._socket]
+        port, local = self._socket.getsockname()[1], config.local_port
+        if local is not None:
+            try:
+                near = replace(config, host="127.0.0.1", port=local, behind_proxy=False, local_port=None)
+                self._sockets.append(_bind(near))
+            except BaseException:
+                self._socket.close()
+                raise
+            local = self._sockets[1].getsockname()[1]
+        self.config = replace(config, port=port, local_port=local)
         hasher = argon2.PasswordHasher(1, 8, 1) if fast_passwords else None
         try:
             self.app = make_app(self.config, hasher)
         except BaseException:
-            self._socket.close()
+            for made in self._sockets:
+                made.close()
             raise
         self.site: Site = self.app.state.site
-        self._socket.listen(_BACKLOG)  # who comes before it is ready waits, instead of being told that nobody is here
+        for made in self._sockets:
+            made.listen(_BACKLOG)  # who comes before it is ready waits, instead of being told that nobody is here
         scheme = "https" if config.tls else "http"
         host = f"[{config.host}]" if ":" in config.host else config.host
         self.url = f"{scheme}://{host}:{port}"
@@ -78,7 +89,7 @@ class Server:
 
     async def _serve(self) -> None:
         self.loop = asyncio.get_running_loop()
-        await self._uvicorn.serve([self._socket])
+        await self._uvicorn.serve(list(self._sockets))
 
     def start(self, timeout_s: float = 60.0) -> Server:
         """Serves in a thread; returns once it answers. Raises OutputError if it does not."""

@@ -55,8 +55,9 @@ def address_of(scope: MutableMapping[str, Any], config: Config) -> str:
 
 def is_local(scope: MutableMapping[str, Any], config: Config) -> bool:
     """Whether a request comes from the instrument's own machine, and not through another server on it."""
-    client = scope.get("client")
-    if config.behind_proxy or client is None or client[0] not in LOOPBACK:
+    client, server = scope.get("client"), scope.get("server")
+    handed_on = config.behind_proxy and (server is None or server[1] != config.local_port)
+    if handed_on or client is None or client[0] not in LOOPBACK:
         return False
     if scope["type"] == "http" and scope.get("http_version") == "1.0":
         return False  # no browser and no program of ours, but proxies as they come
