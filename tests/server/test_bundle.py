@@ -578,6 +578,24 @@ def test_a_download_that_nobody_takes_leaves_nothing(exported: dict[str, Any]) -
     assert not left_over(hub)
 
 
+def test_who_takes_bundles_slowly_does_not_fill_the_disk(exported: dict[str, Any]) -> None:
+    hub = exported["hub"]
+    path = f"/api/cases/{exported['id']}/bundle"
+    taking = hub.site.leaving.taking
+    with Client(hub.url, "operator", PASSWORD) as operator:
+        taking[operator.me.person.id] = 2  # on their way
+        with pytest.raises(HubError, match="you are taking 2 bundles already; wait until one of them has come") as e:
+            operator.raw("GET", path)
+        assert e.value.status == 429
+        taking[operator.me.person.id] = 1
+        assert operator.raw("GET", path).content[:2] == b"PK"
+        with raw(hub, operator, f"GET {path}") as made:
+            assert made.recv(20).startswith(b"HTTP/1.1 200")
+        assert not left_over(hub)
+        assert taking.total() == 1
+        taking.clear()
+
+
 def test_a_full_disk_is_told_before_anything_is_kept(
     hub: Server, elsewhere: Client, file: Path, scan_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-from fringescope.errors import DeviceLostError
+from fringescope.errors import DeviceError, DeviceLostError
 from fringescope.server.processes.parent import Child
 from fringescope.server.running import Server
 from tests.server.conftest import SignIn
@@ -81,6 +81,38 @@ def test_who_ends_the_hub_ends_all_of_it(tmp_path: Path) -> None:
             await first
 
     with_child(work)
+
+
+def test_many_watch_and_the_instrument_is_asked_once(hub: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forty who look put one question at a time to the devices: what must light waits for one frame alone."""
+    instrument = hub.site.instrument
+    busy, most, calls = 0, 0, 0
+
+    async def call(*_: Any, **how: Any) -> dict[str, Any]:
+        nonlocal busy, most, calls
+        busy, calls = busy + 1, calls + 1
+        most = max(most, busy)
+        await asyncio.sleep(0.05)
+        busy -= 1
+        if how["camera"] == "none":
+            raise DeviceError("no camera none")
+        return {"camera": how["camera"], "width": how["width"]}
+
+    async def opened() -> None:
+        return None
+
+    async def watch() -> list[Any]:
+        asked = [instrument.live(c, w, 60) for _ in range(10) for c in ("a", "b") for w in (640, 960)]
+        return await asyncio.gather(*asked, instrument.live("none", 640, 60), return_exceptions=True)
+
+    monkeypatch.setattr(instrument._devices, "call", call)
+    monkeypatch.setattr(instrument, "open", opened)
+    assert hub.loop is not None
+    found = asyncio.run_coroutine_threadsafe(watch(), hub.loop).result(60)
+    assert [x["camera"] + str(x["width"]) for x in found[:4]] == ["a640", "a960", "b640", "b960"]
+    assert isinstance(found[-1], DeviceError)
+    assert (most, calls) == (1, 5)
+    assert instrument._frames == {}
 
 
 def test_nobody_waits_for_the_database_where_all_are_served(hub: Server, sign_in: SignIn) -> None:

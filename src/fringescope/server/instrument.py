@@ -70,6 +70,8 @@ class Instrument:
         self._open = False
         self._cameras: tuple[str, ...] = ()
         self.watching: Counter[str] = Counter()  #: streams of video, by who watches
+        self._frames: dict[tuple[str, int, int], asyncio.Task[Any]] = {}  #: that are being taken for who watches
+        self._filming = asyncio.Lock()
         self._hand = asyncio.Lock()  #: one thing at a time is done with the devices
         hub.carry_out = self.carry_out
         hub.dark = self.dark
@@ -369,9 +371,21 @@ class Instrument:
         """What a camera sees now. Raises DeviceError."""
         if self._busy == "scanning":
             raise DeviceError("the instrument is scanning; there is no live picture meanwhile")
-        await self.open()
-        found: dict[str, Any] = await self._devices.call("live", camera=camera, width=width, quality=quality)
+        key = camera, width, quality
+        if key not in self._frames:  # who asks meanwhile for the same gets the same
+            self._frames[key] = self._begin(self._film(*key))
+            self._frames[key].add_done_callback(lambda task: task.cancelled() or task.exception())
+        found: dict[str, Any] = await asyncio.shield(self._frames[key])
         return found
+
+    async def _film(self, camera: str, width: int, quality: int) -> Any:
+        """One frame. One waits for the devices at a time, however many watch: a start waits for no more than that."""
+        try:
+            async with self._filming:
+                await self.open()
+                return await self._devices.call("live", camera=camera, width=width, quality=quality)
+        finally:
+            del self._frames[camera, width, quality]
 
     async def shown(self) -> bool:
         """Whether the projector itself says that it holds a picture. Raises DeviceError."""
