@@ -16,6 +16,7 @@ import pytest
 from fringescope.client import Client
 from fringescope.server import connections
 from fringescope.server.running import Server
+from fringescope.server.security import counted_as
 from tests.server.conftest import PASSWORD
 from tests.server.people_scenes import WIDE, cookies, hub_at, invited, room_of
 from tests.server.test_hub import scanned
@@ -174,3 +175,8 @@ def test_who_comes_while_it_starts_waits(tmp_path: Path) -> None:
         early.sendall(b"GET /api/health HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         with hub:
             assert early.recv(12) == b"HTTP/1.1 200"
+
+
+def test_who_holds_a_net_is_one() -> None:
+    assert counted_as("2001:db8:1:2::5") == counted_as("2001:db8:1:2:ffff::1") != counted_as("2001:db8:1:3::5")
+    assert (counted_as("::ffff:192.0.2.1"), counted_as("192.0.2.1"), counted_as("x")) == ("192.0.2.1",) * 2 + ("",)

@@ -48,7 +48,7 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
             await site.hub.stop()
             await site.checkpoints.try_to_write()
             await site.instrument.stop()
-            await asyncio.get_running_loop().shutdown_default_executor()  # what still reads or writes is let finish
+            await _quiet(site)
             site.close()
 
     app = FastAPI(
@@ -76,6 +76,15 @@ async def _watch_doors(site: Site) -> None:
         if seen:
             with contextlib.suppress(FringescopeError):
                 site.rooms.end_sessions(await run_in_threadpool(site.accounts.ended, seen))
+
+
+async def _quiet(site: Site) -> None:
+    """Lets whoever still reads or writes finish, though nobody waits for it any more: then no connection is lost."""
+    await asyncio.get_running_loop().shutdown_default_executor()
+    for _ in range(100):
+        if not site.engine.pool.checkedout():
+            return
+        await asyncio.sleep(0.05)
 
 
 async def _keep_hold(site: Site) -> None:

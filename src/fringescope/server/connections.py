@@ -17,6 +17,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from fringescope.server.config import LOOPBACK
+from fringescope.server.security import counted_as
 from fringescope.server.throttle import Bucket
 
 _PIECE = 1 << 14  #: bytes that are looked at before it is asked whether they made too much work
@@ -49,9 +50,9 @@ class Door(socket.socket):
     def accept(self) -> tuple[socket.socket, Any]:
         """The next connection; one too many is closed at once."""
         made, address = super().accept()
-        who = str(address[0])
-        if who in LOOPBACK and not self._one:
+        if address[0] in LOOPBACK and not self._one:
             return made, address
+        who = counted_as(str(address[0]))
         until = self._shut.get(who, 0.0)
         full = self.count >= self._most or (not self._one and self._open[who] >= self._each)
         if full or until > time.monotonic():
@@ -60,11 +61,11 @@ class Door(socket.socket):
         self._open[who] += 1
         return _Counted(made, self, who), address
 
-    def shut(self, who: str) -> None:
+    def shut(self, address: str) -> None:
         """Somebody made too much work: nothing is taken from there for a while."""
-        if not self._one and who not in LOOPBACK:
+        if not self._one and address not in LOOPBACK:
             now = time.monotonic()
-            self._shut = {k: t for k, t in self._shut.items() if t > now} | {who: now + _SHUT_S}
+            self._shut = {k: t for k, t in self._shut.items() if t > now} | {counted_as(address): now + _SHUT_S}
 
     def gone(self, who: str) -> None:
         """A connection was closed."""

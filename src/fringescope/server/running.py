@@ -111,7 +111,7 @@ class Server:
         """Ends it: dark, rooms closed, what waits is written."""
         self._end()
         if self._thread is not None:
-            self._thread.join(30)
+            self._thread.join(60)
 
     def __enter__(self) -> Server:
         return self.start()

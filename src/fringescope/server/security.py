@@ -44,10 +44,15 @@ def address_of(scope: MutableMapping[str, Any], config: Config) -> str:
     if config.behind_proxy:
         named = Headers(scope=scope).getlist("x-forwarded-for")
         said = named[-1].rsplit(",", 1)[-1].strip() if named else said
+    return counted_as(said) or (client[0] if client else "")
+
+
+def counted_as(said: str) -> str:
+    """What an address counts as where it is asked how often, "" for what is none."""
     try:
         address = ipaddress.ip_address(said)
     except ValueError:
-        return client[0] if client else ""
+        return ""
     if isinstance(address, ipaddress.IPv6Address):
         return str(address.ipv4_mapped or ipaddress.ip_network((address, 64), strict=False))
     return str(address)
