@@ -404,6 +404,30 @@ def test_the_right_is_gone_while_drawing(hub: Server, sign_in: SignIn) -> None:
         room.reconnect()
 
 
+def test_the_right_is_gone_in_the_middle_of_many_ops(
+    hub: Server, sign_in: SignIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a time offline: each is judged for itself, and nothing comes behind the word that they are out."""
+    case, expert = scanned(hub, sign_in("operator")), sign_in("expert")
+    invite(case, expert)
+    say = hub.site.hub.say
+
+    async def slowly(*args: Any) -> Any:
+        said = await say(*args)
+        if args[2].number == 3:
+            who = expert.me.person.id
+            await asyncio.to_thread(case.hub.ask, "DELETE", f"/api/cases/{case.id}/members/{who}")
+        return said
+
+    monkeypatch.setattr(hub.site.hub, "say", slowly)
+    lot = [{"client": "c", "number": k, "what": {"kind": "comment", "comment": f"c{k}", "text": "x"}}
+           for k in range(1, 9)]  # fmt: skip
+    with pytest.raises(HubError, match="has ended; what you said before that is written down") as e:
+        HubCase(expert, case.id).say(lot)
+    assert e.value.status == 403
+    assert [x.kind for x in case.events(since=4)] == ["comment"] * 3 + ["revoked"]
+
+
 def _try(room: Room, k: int) -> None:
     with contextlib.suppress(HubError):
         room.say({"kind": "put", "stroke": stroke(f"k{k}"), "scan": SCAN}, wait=False)

@@ -14,7 +14,7 @@ from fringescope.server import database as db
 from fringescope.server import invitations as invited
 from fringescope.server import journal, truth
 from fringescope.server.accounts import new_id
-from fringescope.server.asking import CaseId, Who, problems
+from fringescope.server.asking import CaseId, Who, problems, still
 from fringescope.server.hub import as_event
 from fringescope.server.rights import MAY
 from fringescope.wire import Case, CaseList, Invitation, Op, Person, PersonRole, Status
@@ -139,6 +139,8 @@ async def say(case: CaseId, ops: list[Op], who: Who, request: Request) -> list[S
     for op in ops:
         if op.what.kind == "carry_over":
             raise HTTPException(422, "carry_over: use the route of that name, which looks the job up")
+        if out and not await run_in_threadpool(still, who, case):
+            raise HTTPException(403, "your right to see this case has ended; what you said before that is written down")
         out.append(await who.site.hub.say(case, who.speaker, op))
     return out
 

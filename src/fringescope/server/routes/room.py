@@ -193,7 +193,9 @@ async def _say(
 
     async def answer() -> None:
         try:
-            listener.send((await asking.site.hub.say(case, await _fresh(asking, what), op)).model_dump_json())
+            who = await _fresh(asking, what)
+            if listener.ended is None:  # else they were let go meanwhile: nothing of theirs comes behind that
+                listener.send((await asking.site.hub.say(case, who, op)).model_dump_json())
         except FringescopeError as e:
             refuse(str(e))
 
