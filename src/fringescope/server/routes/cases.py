@@ -135,7 +135,7 @@ async def say(case: CaseId, ops: list[Op], who: Who, request: Request) -> list[S
     counted = [op for op in ops if not (stops and op.what.kind == "stop")]
     if counted:
         who.say_so_many(len(counted), len(await request.body()))
-    out = []
+    out: list[Said] = []
     for op in ops:
         if op.what.kind == "carry_over":
             raise HTTPException(422, "carry_over: use the route of that name, which looks the job up")
