@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import json
 import socket
 import time
 from collections.abc import Iterator
@@ -86,6 +87,18 @@ def test_a_head_without_end(hub: Server) -> None:
         for _ in range(1000):
             raw.sendall(b"a: " + b"x" * 10_000 + b"\r\n")
         raise AssertionError("10 MB of head were taken")
+
+
+def test_what_is_no_request_is_answered_as_all_else_is(hub: Server) -> None:
+    for said in (b"GET /api/health?" + b"x" * 70_000 + b" HTTP/1.1\r\nHost: x\r\n\r\n", b"\x16\x03\x01 hello\r\n\r\n"):
+        with contextlib.closing(opened(hub)) as raw:
+            raw.sendall(said)
+            got = b""
+            while piece := raw.recv(65536):
+                got += piece
+        assert got.startswith(b"HTTP/1.1 400 ")
+        assert b"content-type: application/json" in got
+        assert "send a shorter one" in json.loads(got.split(b"\r\n\r\n", 1)[1])["detail"]
 
 
 def test_a_body_that_trickles(hub: Server) -> None:

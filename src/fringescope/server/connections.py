@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import socket
 import time
 from collections import Counter
 from typing import Any
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -133,8 +135,6 @@ class Http(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         """Begins to wait for the first request."""
-        if hasattr(transport, "max_size"):
-            transport.max_size = _PIECE  # then others have their turn
         super().connection_made(transport)
         self._wait()
 
@@ -150,6 +150,15 @@ class Http(H11Protocol):
         self._wait(over=asked or self.over)
         if left and not self.transport.is_closing():
             self.transport.get_protocol().data_received(left)  # type: ignore[attr-defined]
+
+    def send_400_response(self, msg: str) -> None:
+        """In the form of all our answers."""
+        body = json.dumps({"detail": f"{msg.rstrip('.')}: it is no HTTP, or its head is too long; send a shorter one"})
+        fields = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+        head = h11.Response(status_code=400, headers=[*fields, (b"connection", b"close")], reason=b"Bad Request")
+        for event in (head, h11.Data(data=body.encode()), h11.EndOfMessage()):
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
 
     def on_response_complete(self) -> None:
         """A request was answered."""
