@@ -24,6 +24,7 @@ def main(out: Path, scale: float = 0.125) -> None:
             server.site.accounts.add("operator", password, PersonRole.OPERATOR)
         with Client(server.url, "operator", password) as here, Client(server.url) as afar:
             case = here.open_case("S26-1234", {"organ": "tongue", "pseudonym": "P-17"})
+            print(f"the hub is at {server.url}; it scans (the first time ever takes minutes)", flush=True)
             scan = case.scan("as received").result
             assert scan is not None
             print(f"scan {scan['scan'][7:19]}: {len(case.scans()[0].files)} files")

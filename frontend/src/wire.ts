@@ -20,7 +20,7 @@ export interface Acknowledge {
   suspect: string;
 }
 
-/** The operator confirms what the preview showed. */
+/** The operator, at the instrument, confirms what the preview showed. */
 export interface Arm {
   kind: "arm";
   version: number;
@@ -338,7 +338,7 @@ export interface Presence {
   present: string[];
 }
 
-/** The operator asks to see how a version will look, before they arm it. */
+/** The operator, at the instrument, asks to see how a version will look, before they arm it. */
 export interface Preview {
   kind: "preview";
   version: number;

@@ -24,7 +24,7 @@ FILES = 6
 
 
 def main(folder: Path, port: int, database: str | None) -> None:
-    limits = Limits(ops_per_s=1e6, ops_burst=10**6, logins_per_minute=1e6)
+    limits = Limits(ops_per_s=1e6, ops_burst=10**6, log_bytes_burst=10**9, logins_per_minute=1e6)
     with Server(Config(folder, port=port, database=database, limits=limits), fast_passwords=True) as server:
         if not server.site.accounts.any():
             for role in PersonRole:

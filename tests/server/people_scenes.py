@@ -25,7 +25,8 @@ from tests.server.conftest import PASSWORD, populate
 from tests.server.test_hub import scanned
 
 WIDE = Limits(
-    logins_per_minute=100_000, requests_per_s=100_000, requests_burst=100_000, ops_per_s=1e5, ops_burst=10_000
+    logins_per_minute=100_000, requests_per_s=100_000, requests_burst=100_000, ops_per_s=1e5, ops_burst=10_000,
+    log_bytes_burst=10**9,
 )
 ROLES = ("stranger", "guest", "watcher", "observer", "expert", "operator", "admin")
 S = 1_000_000_000
@@ -128,7 +129,7 @@ def room_of(
         yield made
 
 
-def heard(room: ClientConnection, *types: str, timeout_s: float = 10.0) -> dict[str, Any]:
+def heard(room: ClientConnection, *types: str, timeout_s: float = 30.0) -> dict[str, Any]:
     """The next message of one of these types."""
     while True:
         message: dict[str, Any] = json.loads(room.recv(timeout_s))
@@ -136,7 +137,7 @@ def heard(room: ClientConnection, *types: str, timeout_s: float = 10.0) -> dict[
             return message
 
 
-def closed(room: ClientConnection, timeout_s: float = 10.0) -> tuple[int, str]:
+def closed(room: ClientConnection, timeout_s: float = 30.0) -> tuple[int, str]:
     """With what code and reason a connection is closed; what comes before is passed over."""
     with pytest.raises(ConnectionClosed) as e:
         all(room.recv(timeout_s) is not None for _ in itertools.count())

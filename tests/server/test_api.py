@@ -43,8 +43,8 @@ class World:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[World]:
-    limits = Limits(requests_per_s=1e6, requests_burst=10**6, ops_per_s=1e6, ops_burst=10**6, logins_per_minute=1e7,
-                    failures=10**6)  # fmt: skip
+    limits = Limits(requests_per_s=1e6, requests_burst=10**6, ops_per_s=1e6, ops_burst=10**6, log_bytes_burst=10**9,
+                    logins_per_minute=1e7, failures=10**6)  # fmt: skip
     config = Config(tmp_path_factory.mktemp("api"), port=0, database=database(request), limits=limits)
     with Server(config, fast_passwords=True) as server, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the tool, about itself

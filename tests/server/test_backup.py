@@ -113,13 +113,14 @@ def test_a_folder_takes_only_what_is_new(hub: Server, kept: HubCase, tmp_path: P
 
 def test_while_people_draw_every_backup_is_one_instant(hub: Server, sign_in: SignIn, tmp_path: Path) -> None:
     case = scanned(hub, sign_in("operator"))
-    over = threading.Event()
+    over, drawn = threading.Event(), threading.Event()
 
     def draw() -> None:
         with case.enter() as room:
             k = 0
-            while not over.is_set() and k < 400:
+            while not over.wait(0.03):  # slower than anybody may
                 room.draw(stroke(f"s{k % 50}", float(k)))
+                drawn.set()
                 k += 1
 
     drawing = threading.Thread(target=draw)
@@ -127,6 +128,8 @@ def test_while_people_draw_every_backup_is_one_instant(hub: Server, sign_in: Sig
     try:
         counts = []
         for k in range(3):
+            drawn.clear()
+            assert drawn.wait(60)
             hub.site.checkpoints.write()
             backup.back_up(hub.config.data, tmp_path / f"{k}.zip")
             found = backup.restore(tmp_path / f"{k}.zip", tmp_path / f"restored-{k}")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from alembic.migration import MigrationContext
 from fringescope.client import Client
 from fringescope.errors import FormatError, OutputError
 from fringescope.server import database as db
-from fringescope.server.config import Config
+from fringescope.server.config import Config, Limits
 from fringescope.server.running import Server
 from fringescope.server.site import open_site
 from tests.server.conftest import PASSWORD, SignIn, both, checked, database
@@ -38,6 +39,13 @@ def engine(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[sa.Engine
 def differences(engine: sa.Engine) -> list[Any]:
     with engine.connect() as c:
         return list(compare_metadata(MigrationContext.configure(c, opts={"compare_type": True}), db.metadata))
+
+
+def soon(true: Callable[[], bool], seconds: float = 60.0) -> bool:
+    end = time.monotonic() + seconds
+    while not true() and time.monotonic() < end:
+        time.sleep(0.02)
+    return true()
 
 
 @empty
@@ -121,6 +129,36 @@ def test_one_hub_to_a_database(tmp_path: Path, cluster: Cluster) -> None:
         open_site(Config(tmp_path / "b", database=url))
     first.close()
     open_site(Config(tmp_path / "b", database=url)).close()
+
+
+def test_a_database_that_was_started_anew_is_taken_again_or_the_hub_ends(tmp_path: Path) -> None:
+    """The lock goes with the server; who was quicker has it, and the other hub ends instead of writing beside it."""
+    cluster = Cluster()
+    try:
+        url = cluster.new()
+        config = Config(tmp_path / "a", port=0, database=url, limits=Limits(doors_s=0.1))
+        with Server(config, fast_passwords=True) as hub:
+            held = hub.site.held
+            assert held is not None
+            before = held._connection
+            cluster.stop()
+            cluster.start()
+            assert soon(lambda: held._connection not in (None, before))
+            with pytest.raises(OutputError, match="another hub runs on this database"):
+                open_site(Config(tmp_path / "b", database=url))
+            engine = db.open_engine(url)
+            second = db.Held(engine)
+            with pytest.raises(db.HeldError, match="another hub runs on this database; stop it first"):
+                second.renew()
+            engine.dispose()
+
+            def quicker() -> None:
+                raise db.HeldError("another hub runs on this database")
+
+            held.renew = quicker  # type: ignore[method-assign]
+            assert soon(lambda: hub._thread is not None and not hub._thread.is_alive())
+    finally:
+        cluster.close()
 
 
 def test_a_database_that_is_not_there(tmp_path: Path) -> None:

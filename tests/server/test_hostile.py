@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
 
 from fringescope.client import Client
 from fringescope.server import database as db
@@ -160,9 +163,76 @@ def test_long_ops_count_as_many(tmp_path: Path) -> None:
         taken = sum(a.get("refused") == "" for a in answers)
         assert taken == 10 // (1 + size // 50_000) < 5
         path = f"/api/cases/{world.case.id}/ops"
-        assert asked(world.client("operator"), "POST", path, [op(long) for _ in range(5)]).status_code == 429
+        lot = [op(long) for _ in range(5)]  # more than can ever be there at once: taken once, and waited for after it
+        assert asked(world.client("operator"), "POST", path, lot).status_code == 200
+        assert asked(world.client("operator"), "POST", path, [op({"kind": "stop"})]).status_code == 429
         assert asked(world.client("observer"), "POST", path, [op({"kind": "stop"})] * 10).status_code == 200
         assert asked(world.client("observer"), "POST", path, [op({"kind": "stop"})]).status_code == 429
+
+
+def test_one_person_does_not_fill_the_log(tmp_path: Path) -> None:
+    """By message or by request, good or refused: so many bytes, then a sentence; others are not kept from theirs."""
+    few = replace(WIDE, log_bytes_per_s=0.001, log_bytes_burst=300_000)
+    with world_at(tmp_path, limits=few) as world, room_of(world.client("expert"), world.case.id) as room:
+        long = {"kind": "put", "stroke": stroke("s") | {"pixels": [[k / 7, k / 7] for k in range(2000)]}, "scan": SCAN}
+        size, path = len(json.dumps(long)), f"/api/cases/{world.case.id}/ops"
+        answers = [say(room, long | {"scan": SCAN if k % 2 else "another"})["refused"] for k in range(10)]
+        taken = sum("too much at once" not in a for a in answers)
+        assert 300_000 // (size + 1000) <= taken <= 300_000 // size
+        assert answers[-1].startswith("you have drawn and written too much at once; the log takes ")
+        assert answers[-1].endswith("s and say it again")
+        answer = asked(world.client("expert"), "POST", path, [op(long)])
+        assert (answer.status_code, "too much at once" in answer.text) == (429, True)
+        mine = long | {"stroke": long["stroke"] | {"id": "mine"}}
+        assert asked(world.client("operator"), "POST", path, [op(mine)]).json()[0]["refused"] == ""
+        assert asked(world.client("operator"), "POST", path, [op(mine)] * 9).status_code == 429
+
+
+def test_one_person_does_not_take_all_video(tmp_path: Path) -> None:
+    few = replace(WIDE, videos=5, videos_each=3)
+    with world_at(tmp_path, limits=few) as world, contextlib.ExitStack() as open_:
+
+        def watch(role: str) -> ClientConnection:
+            client = world.client(role)
+            url = f"{client.url.replace('http', 'ws')}/api/cases/{world.case.id}/video/camera1"
+            return open_.enter_context(connect(url, additional_headers={"Cookie": cookies(client)}, compression=None))
+
+        for _ in range(3):
+            assert "no instrument" in heard(watch("guest"), "refusal")["why"]
+        code, why = closed(watch("guest"))
+        assert (code, why) == (1013, "you watch 3 streams already; close one; try again later")
+        for _ in range(2):
+            heard(watch("operator"), "refusal")
+        assert closed(watch("expert")) == (1013, "too many watch already; try again later")
+        open_.close()
+        watching = world.hub.site.instrument.watching
+        assert soon(lambda: not watching.total())  # whoever goes makes room
+
+
+def test_an_answer_to_a_picture_that_is_none(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bytes, deep lists, words without end: that stream ends, and nothing is written of it but that."""
+
+    async def live(*_: Any) -> dict[str, Any]:
+        return {"jpeg": "", "at_ns": 1}
+
+    monkeypatch.setattr(world.hub.site.instrument, "live", live)
+    client = world.client("expert")
+    url = f"{client.url.replace('http', 'ws')}/api/cases/{world.case.id}/video/camera1"
+    for answer in (b"\xff\x00", "[" * 200_000, "x", '{"ack": 2}'):
+        with connect(url, additional_headers={"Cookie": cookies(client)}, compression=None) as video:
+            heard(video, "frame")
+            video.recv(10)
+            with contextlib.suppress(ConnectionClosed):
+                for _ in range(200):
+                    video.send(answer)
+            assert closed(video)[0] == 1000, answer[:10]
+
+
+def soon(true: Callable[[], bool]) -> bool:
+    end = time.monotonic() + 20
+    while not true() and time.monotonic() < end:
+        time.sleep(0.02)
+    return true()
 
 
 def test_one_person_does_not_fill_a_room(tmp_path: Path) -> None:
@@ -235,6 +305,7 @@ def test_limits_are_those_that_are_written_down() -> None:
     x = Limits()
     assert (x.failures, x.locked_s, x.session_s, x.idle_s) == (8, 300.0, 43_200.0, 3600.0)
     assert (x.logins_per_minute, x.requests_per_s, x.ops_per_s, x.message_bytes) == (20.0, 100.0, 40.0, 1_000_000)
+    assert (x.log_bytes_per_s, x.log_bytes_burst, x.videos_each, x.connections_each) == (20_000.0, 8_000_000, 10, 500)
 
 
 def test_the_folder_of_a_hub_is_its_own(world: World) -> None:

@@ -68,7 +68,7 @@ def test_of_two_who_come_at_once_one_comes_in(world: World) -> None:
         made, start = world.case.invite("Dr. Gast"), threading.Barrier(4)
 
         def come(made: Invitation = made, start: threading.Barrier = start) -> int:
-            start.wait(10)
+            start.wait(60)
             return accepted(world, made.token, made.code).status_code
 
         with ThreadPoolExecutor(4) as pool:

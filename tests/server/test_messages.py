@@ -103,7 +103,7 @@ NOT_UNDERSTOOD = {
 @pytest.fixture
 def quick(tmp_path: Any) -> Iterator[Server]:
     """A hub that lets everybody say as much as they like."""
-    limits = Limits(ops_per_s=1e6, ops_burst=10**6, live_per_s=1e6, message_bytes=600_000)
+    limits = Limits(ops_per_s=1e6, ops_burst=10**6, log_bytes_burst=10**9, live_per_s=1e6, message_bytes=600_000)
     with Server(Config(tmp_path / "hub", port=0, limits=limits), fast_passwords=True) as server:
         populate(server)
         yield server
@@ -260,7 +260,7 @@ def nearly(draw: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, HubCase, ClientConnection]]:
-    limits = Limits(ops_per_s=1e6, ops_burst=10**6, live_per_s=1e6)
+    limits = Limits(ops_per_s=1e6, ops_burst=10**6, log_bytes_burst=10**9, live_per_s=1e6)
     with ExitStack() as stack:
         folder = tmp_path_factory.mktemp("messages")
         server = stack.enter_context(Server(Config(folder, port=0, limits=limits), fast_passwords=True))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +18,8 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from fringescope.client import Client
 from fringescope.errors import UsageError
+from fringescope.server import openid
+from fringescope.server.clock import Clock
 from fringescope.server.config import Config, Provider
 from fringescope.server.running import Server
 from tests.server.conftest import PASSWORD
@@ -62,6 +67,39 @@ def back(hub: Server, where: str) -> str:
 
 def come_in(hub: Server, by: httpx.Client) -> httpx.Response:
     return by.get(back(hub, begun(by)))
+
+
+@pytest.mark.parametrize("name", ["authorization_endpoint", "token_endpoint", "jwks_uri"])
+def test_a_provider_elsewhere_has_nothing_to_ask_of_this_machine(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """What it says of itself must not make the hub a messenger to servers that only this machine reaches."""
+    issuer = "https://sso.hospital.example"
+    good = {n: f"{issuer}/{n}" for n in ("authorization_endpoint", "token_endpoint", "jwks_uri")} | {"issuer": issuer}
+    for address in ("http://127.0.0.1:8017/api", "http://localhost/", "file:///etc/passwd", "", "gopher://sso/"):
+        there = openid.OpenId(Provider(issuer, CLIENT, SECRET, role="observer"), "https://hub", Clock(), None)  # type: ignore[arg-type]
+        monkeypatch.setattr(there, "_ask", lambda *_, a=address: good | {name: a})
+        with pytest.raises(openid.ProviderError, match=f"its {name} is no https address"):
+            there.begin()
+
+
+def test_a_provider_that_never_ends_its_answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A byte now and then keeps a connection, and with it whoever signs in, for ever."""
+    monkeypatch.setattr(openid, "_PATIENCE_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def trickle() -> None:
+            made, _ = listening.accept()
+            with made, contextlib.suppress(OSError):
+                made.recv(65536)
+                made.sendall(b"HTTP/1.1 200 OK\r\ncontent-length: 100000\r\n\r\n")
+                for _ in range(600):
+                    made.sendall(b" ")
+                    time.sleep(0.05)
+
+        threading.Thread(target=trickle, daemon=True).start()
+        known = Provider(f"http://127.0.0.1:{listening.getsockname()[1]}", CLIENT, SECRET, role="observer")
+        with hub_at(tmp_path, provider=known) as hub, browser(hub) as by:
+            answer = by.get("/api/provider/begin")
+            assert (answer.status_code, "too slowly" in answer.text) == (503, True)
 
 
 def test_somebody_of_the_provider_comes_in(hub: Server, provider: IdentityProvider) -> None:

@@ -14,7 +14,9 @@ import httpx
 import pytest
 
 from fringescope.client import Client
-from fringescope.server.rights import MAY
+from fringescope.errors import UsageError
+from fringescope.server.config import Config
+from fringescope.server.rights import MAY, WORDS
 from fringescope.wire.ops import Op
 from fringescope.wire.room import FromClient
 from tests.server.conftest import PASSWORD
@@ -125,7 +127,10 @@ SAID: dict[str, tuple[str, dict[str, Any]]] = {
     "stop": (ALL, {}),
     "carry_over": ("", {"version": 1, "scan": SCAN, "job": "job-1"}),  # by its own route alone
 }
-LOCAL = ("arm", "start", "acknowledge")
+LOCAL = ("preview", "arm", "start", "acknowledge")
+#: what belongs to who stands at the instrument, beside these words: whatever projects, or moves what lies there
+AT_THE_INSTRUMENT = ("POST /api/cases/{case}/scans", "POST /api/instrument/poses", "POST /api/instrument/calibrate",
+                     "POST /api/instrument/simulate")  # fmt: skip
 LIVE: dict[str, tuple[str, dict[str, Any]]] = {
     "pointer": (TALK, {"camera": "camera1", "pixel": [1, 2]}),
     "view": (TALK, {"eye_mm": [0, 0, 1], "target_mm": [0, 0, 0], "up": [0, 1, 0]}),
@@ -137,6 +142,18 @@ LIVE: dict[str, tuple[str, dict[str, Any]]] = {
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     with world_at(tmp_path_factory.mktemp("rights")) as made:
         yield made
+
+
+def test_the_description_says_how_one_is_known(world: World) -> None:
+    """Cookie and token, for each route that is not for anybody."""
+    told = world.hub.app.openapi()
+    schemes = told["components"]["securitySchemes"]
+    assert {(s["in"], s["name"]) for s in schemes.values()} == {("cookie", "fringescope"), ("header", "X-CSRF-Token")}
+    for route, row in ROUTES.items():
+        method, path = route.split()
+        if path.startswith("/api"):
+            asked_for = {k for way in told["paths"][path][method.lower()].get("security", []) for k in way}
+            assert asked_for == (set() if row.may == ANYBODY else {"session", "token"}), route
 
 
 def flat(routes: Any) -> Iterator[Any]:
@@ -253,7 +270,7 @@ def judged(role: str, kind: str, may: str, answer: dict[str, Any]) -> None:
         assert "is not for" not in said, said
         assert "at the instrument" not in said, said
     else:
-        assert said == f"{kind} is not for the {name} to do"
+        assert said == f"{WORDS.get(kind, kind)} is not for the {name} to do"
 
 
 @pytest.mark.parametrize("role", PEOPLE)
@@ -320,6 +337,11 @@ def refused_from_afar(client: Client, case: str, **headers: str) -> None:
     """That nothing that belongs to who stands at the instrument is taken from this client."""
     me = asked(client, "GET", "/api/me", **headers).json()
     assert me["local"] is False, headers
+    for route in AT_THE_INSTRUMENT:
+        method, path = route.split()
+        answer = asked(client, method, path.replace("{case}", case), ROUTES[route].body, **headers)
+        assert (answer.status_code, "at the instrument; from afar" in answer.text) == (403, True), (route, answer.text)
+    assert asked(client, "POST", "/api/instrument/stop", **headers).status_code == 200
     with room_of(client, case, **headers) as room:
         assert heard(room, "welcome")["local"] is False
         for kind in LOCAL:
@@ -355,6 +377,30 @@ def test_a_page_from_elsewhere_is_not_at_the_instrument(tmp_path: Path) -> None:
 def test_behind_a_proxy_nobody_is_at_the_instrument(tmp_path: Path) -> None:
     with world_at(tmp_path, behind_proxy=True) as world:
         refused_from_afar(world.client("operator"), world.case.id)
+
+
+def test_behind_a_proxy_a_port_of_its_own_is_for_who_is_there(tmp_path: Path) -> None:
+    """Whoever comes by the port that the proxy hands on is elsewhere; by the other one it is as without a proxy."""
+    with world_at(tmp_path, behind_proxy=True, local_port=0) as world:
+        port = world.hub.config.local_port
+        assert port not in (None, 0, world.hub.config.port)
+        refused_from_afar(world.client("operator"), world.case.id)
+        page = f"http://localhost:{port}"
+        with Client(f"http://127.0.0.1:{port}", "operator", PASSWORD) as here:
+            assert here.me.local
+            with room_of(here, world.case.id, Origin=page) as room:
+                assert heard(room, "welcome")["local"]
+                assert "at the instrument" not in say(room, {"kind": "arm"} | SAID["arm"][1])["refused"]
+            for header, value in FORWARDED.items():  # a proxy that was set up for the wrong port is one all the same
+                refused_from_afar(here, world.case.id, **{header: value})
+            assert asked(here, "POST", f"/api/cases/{world.case.id}/scans", {}, origin=page).status_code == 202
+        with httpx.Client(base_url=f"http://127.0.0.2:{port}") as elsewhere, pytest.raises(httpx.ConnectError):
+            elsewhere.get("/api/health")
+
+
+def test_a_port_for_who_is_there_needs_a_proxy(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="for a hub --behind-proxy"):
+        Config(tmp_path, local_port=0)
 
 
 def test_another_address_is_not_at_the_instrument(world: World) -> None:

@@ -12,7 +12,7 @@ import typer
 from fringescope.cli.app import app
 from fringescope.cli.common import Json, emit
 from fringescope.cli.serving import HOME, Data, Database, needs_extra
-from fringescope.errors import UsageError
+from fringescope.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
     from fringescope.server.audit import Found
@@ -88,6 +88,8 @@ def _key(data: Path, out: Path | None, json: bool) -> None:
     public = points.own_key(data).public_key()
     pem, name = points.public_pem(public).decode(), points.fingerprint(points.raw(public))
     if out is not None:
+        if out.exists():
+            raise OutputError(f"{out}: exists; choose another name")
         with new_file(out) as tmp:
             tmp.write_text(pem)
     lines = [pem.strip() if out is None else str(out), f"fingerprint: {name}"]

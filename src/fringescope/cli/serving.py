@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import getpass
 import os
 import sys
@@ -57,6 +58,10 @@ def serve(
     behind_proxy: Annotated[
         bool, typer.Option("--behind-proxy", help="Another server hands requests on: nobody is local by address.")
     ] = False,
+    local_port: Annotated[
+        int | None,
+        typer.Option(help="Behind a proxy: a port of this machine alone, for who is at the instrument.", max=65535),
+    ] = None,
     oidc_issuer: Annotated[
         str | None, typer.Option(metavar="URL", help="An identity provider (OpenID Connect) whose people may come in.")
     ] = None,
@@ -85,13 +90,18 @@ def serve(
         provider = Provider(oidc_issuer, oidc_client, secret, oidc_role_claim, oidc_role, oidc_admit)
     config = Config(
         data, host, port, database, device, rig, certificate, key, tuple(origin or ()), behind_proxy,
-        load_settings(settings, set_), provider=provider,
+        local_port, load_settings(settings, set_), provider=provider,
     )  # fmt: skip
     server = running.Server(config)
     server.check()
     running.first_admin(server.site, say)
     say(f"research use only; the hub listens at {server.url} (data in {data}); Ctrl-C ends it")
-    server.run()
+    if server.config.local_port is not None:
+        scheme = "https" if server.config.tls else "http"
+        say(f"at the instrument itself: {scheme}://localhost:{server.config.local_port}; hand this port on to nobody")
+    with contextlib.suppress(KeyboardInterrupt):  # it has ended in good order by then
+        server.run()
+    say("the hub has ended")
 
 
 def _secret(file: Path | None) -> str:

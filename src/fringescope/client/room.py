@@ -146,9 +146,9 @@ class Room:
         if isinstance(m, Event):
             if m.seq <= self._seq:
                 return
-            self._seq = m.seq
-            with self._news:
+            with self._news:  # who sees the number finds the event
                 self.events.append(m)
+                self._seq = m.seq
                 self._news.notify_all()
             if self.on_event is not None:
                 self.on_event(m)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -18,6 +19,7 @@ from fringescope import __version__
 from fringescope.errors import FringescopeError, OutputError
 from fringescope.server.asking import one_line
 from fringescope.server.config import Config
+from fringescope.server.database import HeldError
 from fringescope.server.routes import audit, cases, leaving, passkeys, people, room, scans, signing
 from fringescope.server.security import Guarded
 from fringescope.server.site import Site, open_site
@@ -33,17 +35,20 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         await site.instrument.start()
         doors = asyncio.create_task(_watch_doors(site), name="doors")
         points = asyncio.create_task(site.checkpoints.run(config.checkpoint_s), name="checkpoints")
+        hold = asyncio.create_task(_keep_hold(site), name="hold")
         try:
             yield
         finally:
-            doors.cancel()
+            for task in (doors, points, hold):
+                task.cancel()
+            await asyncio.gather(doors, points, hold, return_exceptions=True)
             site.rooms.end()
             await site.jobs.stop()
             await site.leaving.stop()
-            points.cancel()
             await site.hub.stop()
             await site.checkpoints.try_to_write()
             await site.instrument.stop()
+            await _quiet(site)
             site.close()
 
     app = FastAPI(
@@ -71,6 +76,29 @@ async def _watch_doors(site: Site) -> None:
         if seen:
             with contextlib.suppress(FringescopeError):
                 site.rooms.end_sessions(await run_in_threadpool(site.accounts.ended, seen))
+
+
+async def _quiet(site: Site) -> None:
+    """Lets whoever still reads or writes finish, though nobody waits for it any more: then no connection is lost."""
+    await asyncio.get_running_loop().shutdown_default_executor()
+    for _ in range(100):
+        if not site.engine.pool.checkedout():
+            return
+        await asyncio.sleep(0.05)
+
+
+async def _keep_hold(site: Site) -> None:
+    """The database stays this hub's, also when it was started anew; if another hub was quicker, this one ends."""
+    while site.held is not None:
+        await asyncio.sleep(site.config.limits.doors_s)
+        try:
+            await run_in_threadpool(site.held.renew)
+        except HeldError as e:
+            logging.getLogger("uvicorn.error").error("the hub ends: %s", e)
+            site.end()
+            return
+        except OutputError:
+            continue  # it is away: nothing can be written meanwhile, and it is asked again
 
 
 def _explain(app: FastAPI) -> None:

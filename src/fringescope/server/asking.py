@@ -6,7 +6,8 @@ import hmac
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import Depends, HTTPException, Path, Request
+from fastapi import Depends, HTTPException, Path, Request, Security
+from fastapi.security import APIKeyCookie, APIKeyHeader
 from starlette.requests import HTTPConnection
 
 from fringescope.server import cases
@@ -20,6 +21,7 @@ from fringescope.wire import PersonRole, Problem
 
 CaseId = Annotated[str, Path(pattern=r"^case-[0-9a-f]{20}$", description="Identifier of a case.")]
 _LONG_OP = 50_000  #: bytes of an op that counts as two
+_ENTRY = 500  #: bytes of an entry of the log beside its words
 _OF_ERASED = ("case.read", "job.read")  #: what may still be asked of a case that was erased
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
@@ -79,10 +81,21 @@ class Asking:
         if why:
             raise HTTPException(403, why)
 
-    def say_so_many(self, n: int) -> None:
-        """Raises 429 where somebody says more than they may."""
-        if n and (wait := self.site.ops.take(self.speaker.person, n)):
-            raise HTTPException(429, f"too many ops; wait {wait:.0f} s", headers={"retry-after": f"{wait:.0f}"})
+    def say_so_many(self, n: int, size: int) -> None:
+        """Raises 429 where somebody says more than they may: so many ops of so many bytes together."""
+        why, wait = self.too_much(n, size)
+        if why:
+            raise HTTPException(429, why, headers={"retry-after": f"{wait:.0f}"})
+
+    def too_much(self, n: int, size: int) -> tuple[str, float]:
+        """Why a person must wait before they say so many ops of so many bytes, "" if they need not; how many s."""
+        person, limits = self.speaker.person, self.site.config.limits
+        if wait := self.site.ops.take(person, n + size // _LONG_OP):
+            return f"too many ops; wait {wait:.0f} s and say it again", wait
+        if wait := self.site.written.take(person, size + n * _ENTRY):
+            each = f"the log takes {limits.log_bytes_per_s / 1000:g} kB a second from one person"
+            return f"you have drawn and written too much at once; {each}: wait {wait:.0f} s and say it again", wait
+        return "", 0.0
 
     def case(self, case: str, what: str) -> None:
         """Raises 403 unless they may do it in a case, 404 where there is none, or none that they may see."""
@@ -125,7 +138,19 @@ def asking_of(request: HTTPConnection) -> Asking:
     return Asking(site, session, Speaker(p.id, p.role, local, session.case, session.confirmed_ns))
 
 
-def signed_in(request: Request) -> Asking:
+_COOKIE = APIKeyCookie(
+    name="fringescope", scheme_name="session", auto_error=False,
+    description="A session's cookie, as POST /api/login sets it; over https it is called __Host-fringescope.",
+)  # fmt: skip
+_TOKEN = APIKeyHeader(
+    name="X-CSRF-Token", scheme_name="token", auto_error=False,
+    description="The session's `csrf`, as POST /api/login and GET /api/me tell it: for all but GET.",
+)  # fmt: skip
+
+
+def signed_in(
+    request: Request, _cookie: Annotated[Any, Security(_COOKIE)] = None, _token: Annotated[Any, Security(_TOKEN)] = None
+) -> Asking:
     """For routes: 401 for a stranger, 403 without the token that other sites' pages do not have."""
     try:
         asking = asking_of(request)

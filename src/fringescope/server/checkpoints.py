@@ -16,6 +16,7 @@ import json
 import logging
 import os
 import secrets
+import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,9 +154,14 @@ class Checkpoints:
         self._told: Heads = {}
         self._file: Path | None = None
         self._prev = ""
+        self._lock = threading.Lock()  #: one at a time, also when somebody no longer waits for the one before
 
     def write(self) -> Path | None:
         """A checkpoint, if any log has moved since the last one; its file. Raises OutputError."""
+        with self._lock:
+            return self._write()
+
+    def _write(self) -> Path | None:
         now = self._clock.now_ns()
         heads = journal.heads(self._engine)
         file = self._folder / f"{datetime.datetime.fromtimestamp(now / 1e9, datetime.UTC):%Y-%m-%d}.jsonl"

@@ -21,6 +21,8 @@ class Limits:
     upload_bytes: int = 16_000_000_000  #: longest bundle: a scan of full size has about 2 GB
     ops_per_s: float = 40.0  #: ops of one connection, on average
     ops_burst: int = 400  #: and at once, as after a time offline
+    log_bytes_per_s: float = 20_000.0  #: what one person writes into the logs, on average: 1.7 GB a day at most
+    log_bytes_burst: int = 8_000_000  #: and at once
     live_per_s: float = 120.0  #: pointers, views and ink of one connection
     requests_per_s: float = 100.0  #: requests of one address
     requests_burst: int = 500
@@ -36,6 +38,11 @@ class Limits:
     waiting_letters: int = 16_000_000  #: and how long they may be together
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
+    videos_each: int = 10  #: of one person: two pages with all cameras
+    bundles_each: int = 2  #: bundles that one person takes at once: each lies on the disk meanwhile
+    connections: int = 2000  #: open connections from other machines
+    connections_each: int = 500  #: of one address
+    body_s: float = 30.0  #: a body may pause for so long, and has 1 kB a second on average after that
 
 
 @dataclass(frozen=True)
@@ -86,6 +93,7 @@ class Config:
     key: Path | None = None
     origins: tuple[str, ...] = ()  #: further origins of pages that may talk to it, as https://hub.hospital.example
     behind_proxy: bool = False  #: another server hands requests on: nobody is local by their address alone
+    local_port: int | None = None  #: behind a proxy: a port of this machine alone, for who stands at the instrument
     settings: Settings = field(default_factory=Settings)
     limits: Limits = Limits()
     provider: Provider | None = None
@@ -96,6 +104,8 @@ class Config:
             raise UsageError("--oidc-issuer needs --origin: where the provider sends people back to")
         if (self.certificate is None) != (self.key is None):
             raise UsageError("--certificate and --key belong together; give both, or --self-signed")
+        if self.local_port is not None and not self.behind_proxy:
+            raise UsageError("--local-port is for a hub --behind-proxy; without one its own port is local already")
         if self.host not in LOOPBACK and self.certificate is None:
             raise UsageError(
                 f"--host {self.host}: others could listen in; needed a certificate and its key (--certificate, --key), "
@@ -122,5 +132,7 @@ class Config:
         """Origins of its own pages."""
         scheme = "https" if self.tls else "http"
         names = {self.host, *(LOOPBACK if self.host in LOOPBACK else ())} - {"0.0.0.0", "::"}
-        hosts = [f"[{n}]" if ":" in n else n for n in sorted(names)]
-        return (*(f"{scheme}://{n}:{self.port}" for n in hosts), *self.origins)
+        pages = [(n, self.port) for n in sorted(names)]
+        if self.local_port is not None:
+            pages += [(n, self.local_port) for n in LOOPBACK]
+        return (*(f"{scheme}://{f'[{n}]' if ':' in n else n}:{port}" for n, port in pages), *self.origins)

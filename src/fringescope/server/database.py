@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -217,22 +218,60 @@ def forget_erased(engine: sa.Engine) -> None:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
-def hold(engine: sa.Engine) -> sa.Connection | None:
-    """Takes hold of a database that others can reach, one hub at a time, until the connection is closed.
+class Held:
+    """A database that others can reach, held by one hub: a lock that lasts as long as a connection does."""
 
-    None for SQLite, which lies in a folder that is held. Raises OutputError if another hub has it.
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+        self._connection: sa.Connection | None = None
+
+    def take(self) -> None:
+        """Takes hold of it. Raises OutputError if another hub has it, or nobody answers."""
+        try:
+            self._connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+            self._connection.detach()  # it is no part of the pool: when it is closed the lock is gone
+            ours = self._connection.execute(sa.select(sa.func.pg_try_advisory_lock(_HELD))).scalar()
+        except sa.exc.OperationalError as e:
+            self.let_go()
+            raise OutputError(f"the database cannot be reached: {' '.join(str(e.orig).split())}; is it there?") from e
+        if not ours:
+            self.let_go()
+            raise HeldError("another hub runs on this database; stop it first, or give this one a database of its own")
+
+    def renew(self) -> None:
+        """Takes hold anew where the database was started anew meanwhile. Raises HeldError if another hub was quicker,
+        OutputError while nobody answers.
+        """
+        if self._connection is not None:
+            try:
+                self._connection.execute(sa.select(1))
+                return
+            except sa.exc.DBAPIError:
+                self.let_go()
+        self.take()
+
+    def let_go(self) -> None:
+        """Others may have it."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with contextlib.suppress(sa.exc.DBAPIError):
+                connection.close()
+
+
+class HeldError(OutputError):
+    """Another hub has the database."""
+
+
+def hold(engine: sa.Engine) -> Held | None:
+    """Takes hold of a database that others can reach, one hub at a time; None for SQLite, whose folder is held.
+
+    Raises OutputError if another hub has it.
     """
     if engine.dialect.name == "sqlite":
         return None
-    try:
-        connection = engine.connect().execution_options(isolation_level="AUTOCOMMIT")
-    except sa.exc.OperationalError as e:
-        raise OutputError(f"the database cannot be reached: {' '.join(str(e.orig).split())}; is it there?") from e
-    connection.detach()  # it is no part of the pool: when it is closed the lock is gone
-    if not connection.execute(sa.select(sa.func.pg_try_advisory_lock(_HELD))).scalar():
-        connection.close()
-        raise OutputError("another hub runs on this database; stop it first, or give this one a database of its own")
-    return connection
+    held = Held(engine)
+    held.take()
+    return held
 
 
 def _alembic(engine: sa.Engine) -> AlembicConfig:

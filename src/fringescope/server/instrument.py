@@ -11,6 +11,7 @@ import base64
 import contextlib
 import json
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ from fringescope.wire.documents import InstrumentState
 _BEAT_S = 0.1
 _TELL_S = 1.5  #: a verdict that is like the one before is written down so often
 _DARK_S = 0.04  #: the stop button is pressed if the process does not say in this time that it is dark
+_BEFALLS = ("move", "turn", "dent", "dry", "ring", "cover", "scene", "pose", "board")
 _IDLE_S = 600.0  #: the watchdog rests when nothing was projected for so long
 
 
@@ -67,7 +69,9 @@ class Instrument:
         self._why = ""
         self._open = False
         self._cameras: tuple[str, ...] = ()
-        self.watching = 0  #: streams of video
+        self.watching: Counter[str] = Counter()  #: streams of video, by who watches
+        self._frames: dict[tuple[str, int, int], asyncio.Task[Any]] = {}  #: that are being taken for who watches
+        self._filming = asyncio.Lock()
         self._hand = asyncio.Lock()  #: one thing at a time is done with the devices
         hub.carry_out = self.carry_out
         hub.dark = self.dark
@@ -367,15 +371,29 @@ class Instrument:
         """What a camera sees now. Raises DeviceError."""
         if self._busy == "scanning":
             raise DeviceError("the instrument is scanning; there is no live picture meanwhile")
-        await self.open()
-        found: dict[str, Any] = await self._devices.call("live", camera=camera, width=width, quality=quality)
+        key = camera, width, quality
+        if key not in self._frames:  # who asks meanwhile for the same gets the same
+            self._frames[key] = self._begin(self._film(*key))
+            self._frames[key].add_done_callback(lambda task: task.cancelled() or task.exception())
+        found: dict[str, Any] = await asyncio.shield(self._frames[key])
         return found
+
+    async def _film(self, camera: str, width: int, quality: int) -> Any:
+        """One frame. One waits for the devices at a time, however many watch: a start waits for no more than that."""
+        try:
+            async with self._filming:
+                await self.open()
+                return await self._devices.call("live", camera=camera, width=width, quality=quality)
+        finally:
+            del self._frames[camera, width, quality]
 
     async def shown(self) -> bool:
         """Whether the projector itself says that it holds a picture. Raises DeviceError."""
         return bool(await self._devices.call("shown"))
 
     async def befall(self, what: dict[str, str]) -> None:
-        """For the simulated instrument: something happens to the specimen."""
+        """For the simulated instrument: something happens to the specimen. Raises UsageError for what cannot."""
+        if unknown := sorted(set(what) - set(_BEFALLS)):
+            raise UsageError(f"{unknown[0][:40]!r} befalls no specimen; needed some of {', '.join(_BEFALLS)}")
         await self.open()
         await self._devices.call("befall", what=what)

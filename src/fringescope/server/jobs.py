@@ -34,7 +34,7 @@ class Jobs:
                       "ended_ns": clock.now_ns()}  # fmt: skip
             c.execute(db.jobs.update().where(left).values(values))
 
-    def begin(self, kind: str, case: str | None, person: str, work: Work) -> Job:
+    async def begin(self, kind: str, case: str | None, person: str, work: Work) -> Job:
         """A new job, which begins when those before it have ended. Raises UsageError where too many wait."""
         if len(self._now) >= _WAITING:
             raise UsageError(f"{len(self._now)} jobs wait already; try again when one has ended")
@@ -42,12 +42,19 @@ class Jobs:
             id=new_id("job"), kind=kind, case=case, state=JobState.WAITING, stage="", share=0.0,
             created_ns=self._clock.now_ns(),
         )  # fmt: skip
-        row = job.model_dump(mode="json", exclude={"case"})
-        with db.writing(self._engine) as c:
-            c.execute(db.jobs.insert().values(**row, case_id=case, person_id=person))
-        self._now[job.id] = job
+        row = {**job.model_dump(mode="json", exclude={"case"}), "case_id": case, "person_id": person}
+        self._now[job.id] = job  # it counts from now on
+        try:
+            await asyncio.to_thread(self._insert, row)  # a database may be busy for seconds: nobody else waits for it
+        except BaseException:
+            del self._now[job.id]
+            raise
         self._tasks[job.id] = asyncio.create_task(self._run(job, work), name=job.id)
         return job
+
+    def _insert(self, row: dict[str, Any]) -> None:
+        with db.writing(self._engine) as c:
+            c.execute(db.jobs.insert().values(row))
 
     async def _run(self, job: Job, work: Work) -> None:
         def tell(stage: str, share: float) -> None:

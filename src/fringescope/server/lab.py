@@ -54,11 +54,11 @@ class Lab:
             return await self.keep(case, label, folder / "scan", doc)
 
     async def _computed(self, what: str, tell: Tell, **how: Any) -> Any:
-        """Has the workshop compute something; who cancels that ends the workshop, which starts again when needed."""
+        """Has the workshop compute something; who cancels that ends it at once, and all else begins anew."""
         try:
             return await self._workshop.call(what, tell, **how)
         except asyncio.CancelledError:
-            await self._workshop.kill()
+            await asyncio.shield(self._workshop.restart())
             raise
 
     async def keep(

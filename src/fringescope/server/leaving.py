@@ -15,6 +15,7 @@ import os
 import secrets
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,7 @@ class Leaving:
         self._jobs, self._instrument, self._lab, self._key = jobs, instrument, lab, checkpoints.key
         self._packer = Child("fringescope.server.processes.packer")
         self._turn = asyncio.Lock()
+        self.taking: Counter[str] = Counter()  #: bundles on their way out, by who takes them
 
     async def stop(self) -> None:
         """Ends what is going on."""
@@ -245,7 +247,7 @@ class Leaving:
         try:
             return await self._packer.call(name, tell, **args)
         except asyncio.CancelledError:
-            await self._packer.kill()
+            await asyncio.shield(self._packer.restart())
             raise
 
     def _unpack_scan(self, file: Path, to: Path) -> Path:

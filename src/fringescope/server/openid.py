@@ -10,6 +10,7 @@ import base64
 import hashlib
 import secrets
 import threading
+import time
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote_plus, urlencode, urlsplit
@@ -33,6 +34,7 @@ _LEEWAY_S = 60  #: by which clocks may differ
 _KEYS_S = 60.0  #: keys are asked for anew so often at most
 _AGAIN_S = 5.0  #: one that did not answer is asked again so often at most: who waits for it keeps others from working
 _LONGEST = 1_000_000  #: bytes of an answer
+_PATIENCE_S = 10.0  #: within so long it must have come
 _ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA")
 _WRONG = "the identity provider's answer does not fit; begin again"
 
@@ -107,7 +109,8 @@ class OpenId:
                     )
                 for name in ("authorization_endpoint", "token_endpoint", "jwks_uri"):
                     parts = urlsplit(str(about.get(name, "")))
-                    if parts.scheme != "https" and not (parts.scheme == "http" and parts.hostname in LOOPBACK):
+                    near = parts.scheme == "http" and parts.hostname in LOOPBACK and issuer.startswith("http://")
+                    if parts.scheme != "https" and not near:  # a provider elsewhere has nothing to ask of this machine
                         raise ProviderError(f"{issuer}: its {name} is no https address; it cannot be trusted")
                 self._about = about
             return self._about
@@ -115,10 +118,13 @@ class OpenId:
     def _ask(self, method: str, url: str, **how: Any) -> dict[str, Any]:
         """One question to the provider: no redirects, no long answers."""
         try:
+            begun = time.monotonic()
             with httpx.stream(method, url, timeout=5.0, headers={"accept": "application/json"}, **how) as answer:
                 body = b""
                 for piece in answer.iter_bytes():
                     body += piece
+                    if time.monotonic() - begun > _PATIENCE_S:
+                        raise ProviderError("the identity provider answers too slowly; try again")
                     if len(body) > _LONGEST:
                         raise ProviderError(f"the identity provider's answer is longer than {_LONGEST} bytes")
             found = httpx.Response(answer.status_code, content=body).json()

@@ -45,6 +45,7 @@ MAY: dict[str, frozenset[PersonRole]] = {
     # the instrument
     "scan.take": frozenset({OPERATOR}),
     "scan.add": frozenset({OPERATOR}),
+    "scan.compare": frozenset({OPERATOR}),
     "instrument.calibrate": frozenset({OPERATOR}),
     "instrument.read": frozenset({OPERATOR, EXPERT, OBSERVER, ADMIN}),
     "instrument.stop": EVERYBODY,
@@ -58,8 +59,19 @@ MAY: dict[str, frozenset[PersonRole]] = {
     "audit": frozenset({ADMIN}),
 }
 
-#: what only somebody at the instrument itself may say
-LOCAL = frozenset({"arm", "start", "acknowledge"})
+#: how it is called on a screen, where that is not its name
+WORDS = {
+    "case.open": "to open a case", "case.change": "to change a case", "case.patient": "to name the patient",
+    "case.erase": "to erase a case", "case.bundle": "to take a case away", "case.import": "to bring a case in",
+    "case.invite": "to invite somebody", "case.read": "to read a case", "case.list": "to list cases",
+    "scan.take": "to scan", "scan.add": "to add a scan", "scan.compare": "to compare scans",
+    "instrument.calibrate": "to calibrate", "instrument.read": "to look at the instrument", "job.read": "to see jobs",
+    "job.cancel": "to see all jobs or end one", "people.list": "to see who has an account",
+    "people.change": "to change accounts", "audit": "to judge the log", "carry_over": "to carry strokes over",
+}  # fmt: skip
+
+#: what only somebody at the instrument itself may do: all that projects, and the look that comes before it
+LOCAL = frozenset({"preview", "arm", "start", "acknowledge", "scan.take", "instrument.calibrate"})
 
 #: what needs the password once more, not long ago
 CONFIRMED = frozenset({"sign"})
@@ -84,10 +96,11 @@ class Speaker:
 
 def refusal(speaker: Speaker, what: str, now_ns: int = 0) -> str:
     """Why somebody may not do something, in a sentence; "" where they may."""
+    words = WORDS.get(what, what)
     if speaker.role not in MAY.get(what, frozenset()):
-        return f"{what} is not for the {speaker.role.value} to do"
+        return f"{words} is not for the {speaker.role.value} to do"
     if what in LOCAL and not speaker.local:
-        return f"{what} is for the operator at the instrument; from afar you can propose and stop"
+        return f"{words} is for the operator at the instrument; from afar you can propose and stop"
     if what in CONFIRMED and (now_ns - speaker.confirmed_ns) > CONFIRMED_S * 1e9:
         return f"{what} needs your password once more; confirm it and sign again"
     return ""

@@ -12,6 +12,7 @@ import socket
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import uvicorn
@@ -19,10 +20,14 @@ import uvicorn
 from fringescope.errors import OutputError, UsageError
 from fringescope.server.app import make_app
 from fringescope.server.config import LOOPBACK, Config
+from fringescope.server.connections import Door, Http, WebSocket, more_files
 from fringescope.server.site import Site
 from fringescope.wire import PersonRole
 
 _DEAF_MS = 60_000  #: a connection through which nothing can be sent for so long is given up
+_BACKLOG = 2048  #: connections that wait to be taken
+_FILES = 8192  #: open files that are asked for
+_OWN_FILES = 200  #: of them for the database, scans, processes and this machine's own connections
 DAYS = 397  #: how long a self-made certificate is good
 
 
@@ -32,27 +37,41 @@ class Server:
     def __init__(self, config: Config, *, fast_passwords: bool = False) -> None:
         import argon2
 
-        self._socket = _bind(config.host, config.port)
-        port = self._socket.getsockname()[1]
-        self.config = replace(config, port=port)
+        self._socket = _bind(config)
+        self._sockets = [self._socket]
+        port, local = self._socket.getsockname()[1], config.local_port
+        if local is not None:
+            try:
+                near = replace(config, host="127.0.0.1", port=local, behind_proxy=False, local_port=None)
+                self._sockets.append(_bind(near))
+            except BaseException:
+                self._socket.close()
+                raise
+            local = self._sockets[1].getsockname()[1]
+        self.config = replace(config, port=port, local_port=local)
         hasher = argon2.PasswordHasher(1, 8, 1) if fast_passwords else None
         try:
             self.app = make_app(self.config, hasher)
         except BaseException:
-            self._socket.close()
+            for made in self._sockets:
+                made.close()
             raise
         self.site: Site = self.app.state.site
+        for made in self._sockets:
+            made.listen(_BACKLOG)  # who comes before it is ready waits, instead of being told that nobody is here
         scheme = "https" if config.tls else "http"
         host = f"[{config.host}]" if ":" in config.host else config.host
         self.url = f"{scheme}://{host}:{port}"
         limits = config.limits
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
-                self.app, log_level="warning", ssl_certfile=config.certificate, ssl_keyfile=config.key,
+                self.app, http=partial(Http, door=self._socket), ws=partial(WebSocket, door=self._socket),  # type: ignore[arg-type]
+                log_level="warning", ssl_certfile=config.certificate, ssl_keyfile=config.key,
                 ws_max_size=4 * limits.message_bytes, ws_ping_interval=20, ws_ping_timeout=20, proxy_headers=False,
                 server_header=False, timeout_graceful_shutdown=5, timeout_keep_alive=30, ws_per_message_deflate=False,
             )
         )  # fmt: skip
+        self.site.end = self._end
         self._thread: threading.Thread | None = None
         self.loop: asyncio.AbstractEventLoop | None = None  #: that of the hub, while it runs
 
@@ -70,7 +89,7 @@ class Server:
 
     async def _serve(self) -> None:
         self.loop = asyncio.get_running_loop()
-        await self._uvicorn.serve([self._socket])
+        await self._uvicorn.serve(list(self._sockets))
 
     def start(self, timeout_s: float = 60.0) -> Server:
         """Serves in a thread; returns once it answers. Raises OutputError if it does not."""
@@ -85,11 +104,14 @@ class Server:
             end.wait(0.02)
         raise OutputError("the hub did not start; see what it printed above")
 
+    def _end(self) -> None:
+        self._uvicorn.should_exit = True
+
     def close(self) -> None:
         """Ends it: dark, rooms closed, what waits is written."""
-        self._uvicorn.should_exit = True
+        self._end()
         if self._thread is not None:
-            self._thread.join(30)
+            self._thread.join(60)
 
     def __enter__(self) -> Server:
         return self.start()
@@ -98,10 +120,11 @@ class Server:
         self.close()
 
 
-def _bind(host: str, port: int) -> socket.socket:
+def _bind(config: Config) -> Door:
+    host, port, limits = config.host, config.port, config.limits
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio sends small messages at once only where a socket says that it is TCP
-    made = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    most = min(limits.connections, more_files(_FILES) - _OWN_FILES)
+    made = Door(family, most, limits.connections_each, config.behind_proxy)
     made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     if hasattr(socket, "TCP_USER_TIMEOUT"):  # who takes nothing for so long is cut off, closed or not
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _DEAF_MS)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import json
 import re
+import time
 from collections.abc import MutableMapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,6 +27,7 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
+_SLOWEST = 1000  #: bytes a second of a body, on average
 _SAFE = ("GET", "HEAD", "OPTIONS")
 _UPLOADS = re.compile(r"/api/cases/(import|[^/]+/scans/import)")
 _FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "x-cluster-client-ip", "true-client-ip", "cf-ray",
@@ -41,10 +44,15 @@ def address_of(scope: MutableMapping[str, Any], config: Config) -> str:
     if config.behind_proxy:
         named = Headers(scope=scope).getlist("x-forwarded-for")
         said = named[-1].rsplit(",", 1)[-1].strip() if named else said
+    return counted_as(said) or (client[0] if client else "")
+
+
+def counted_as(said: str) -> str:
+    """What an address counts as where it is asked how often, "" for what is none."""
     try:
         address = ipaddress.ip_address(said)
     except ValueError:
-        return client[0] if client else ""
+        return ""
     if isinstance(address, ipaddress.IPv6Address):
         return str(address.ipv4_mapped or ipaddress.ip_network((address, 64), strict=False))
     return str(address)
@@ -52,8 +60,9 @@ def address_of(scope: MutableMapping[str, Any], config: Config) -> str:
 
 def is_local(scope: MutableMapping[str, Any], config: Config) -> bool:
     """Whether a request comes from the instrument's own machine, and not through another server on it."""
-    client = scope.get("client")
-    if config.behind_proxy or client is None or client[0] not in LOOPBACK:
+    client, server = scope.get("client"), scope.get("server")
+    handed_on = config.behind_proxy and (server is None or server[1] != config.local_port)
+    if handed_on or client is None or client[0] not in LOOPBACK:
         return False
     if scope["type"] == "http" and scope.get("http_version") == "1.0":
         return False  # no browser and no program of ours, but proxies as they come
@@ -126,12 +135,20 @@ class Guarded:
             await _refuse(sent, 413, f"a body of {length[:20]} bytes; at most {longest} are taken")
             return
         count = 0
-        began = over = False
+        began = over = whole = False
+        since = time.monotonic()
 
         async def received() -> Message:
-            nonlocal count, over
-            message = await receive()
+            nonlocal count, over, whole
+            try:
+                message = await asyncio.wait_for(receive(), None if whole else limits.body_s)
+            except TimeoutError:
+                return {"type": "http.disconnect"}  # whoever reads the body hears that it ended
+            whole = whole or not message.get("more_body", False)
             count += len(message.get("body", b""))
+            late = time.monotonic() - since - limits.body_s
+            if not whole and late > 0 and count < _SLOWEST * late:
+                return {"type": "http.disconnect"}
             if count > longest:
                 over = True
                 raise _TooLongError

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import argon2
-import sqlalchemy as sa
 
 from fringescope.errors import OutputError
 from fringescope.server import database as db
@@ -51,17 +51,19 @@ class Site:
     requests: Throttle
     logins: Throttle
     ops: Throttle
+    written: Throttle
     passkeys: Passkeys
     provider: OpenId | None
     checkpoints: Checkpoints
     leaving: Leaving
     lock: int
-    database_lock: sa.Connection | None
+    held: db.Held | None
+    end: Callable[[], None] = lambda: None  #: ends the hub: whoever serves it says how
 
     def close(self) -> None:
         """Lets go of the data folder and the database."""
-        if self.database_lock is not None:
-            self.database_lock.close()
+        if self.held is not None:
+            self.held.let_go()
         self.engine.dispose()
         os.close(self.lock)
 
@@ -94,9 +96,9 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         engine = db.open_engine(config.url)
         undo.callback(engine.dispose)
-        database_lock = db.hold(engine)
-        if database_lock is not None:
-            undo.callback(database_lock.close)
+        held = db.hold(engine)
+        if held is not None:
+            undo.callback(held.let_go)
         db.migrate(engine)
         shutil.rmtree(config.data / "work", ignore_errors=True)  # of a hub that was killed
         clock = Clock(journal.last_ns(engine))
@@ -116,9 +118,10 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
             instrument, lab, Throttle(limits.requests_per_s, limits.requests_burst),
             Throttle(limits.logins_per_minute / 60, limits.logins_per_minute),
-            Throttle(limits.ops_per_s, limits.ops_burst), Passkeys(engine, clock, accounts),
+            Throttle(limits.ops_per_s, limits.ops_burst),
+            Throttle(limits.log_bytes_per_s, limits.log_bytes_burst), Passkeys(engine, clock, accounts),
             None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), checkpoints,
-            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock, database_lock,
+            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock, held,
         )  # fmt: skip
         undo.pop_all()
     return site

@@ -16,19 +16,20 @@ class Bucket:
         self._level, self._at = burst, time.monotonic()
 
     def take(self, n: float = 1) -> bool:
-        """Whether there is room for `n` more; they are counted if so."""
+        """Whether there is room for `n` more; they are counted if so. More than `burst` at once need a full bucket,
+        and are waited for afterwards.
+        """
         now = time.monotonic()
         self._level = min(self.burst, self._level + self.rate * (now - self._at))
         self._at = now
-        if self._level < n:
+        if self._level < min(n, self.burst):
             return False
         self._level -= n
         return True
 
-    @property
-    def wait_s(self) -> float:
-        """How long until there is room for one more."""
-        return max(0.0, (1 - self._level) / self.rate)
+    def wait_s(self, n: float = 1) -> float:
+        """How long until there is room for `n` more."""
+        return max(0.0, (min(n, self.burst) - self._level) / self.rate)
 
     @property
     def full(self) -> bool:
@@ -51,4 +52,4 @@ class Throttle:
                 self._buckets = {k: b for k, b in self._buckets.items() if not b.full}
                 self._swept = time.monotonic()
             bucket = self._buckets.setdefault(key, Bucket(self._rate, self._burst))
-            return 0.0 if bucket.take(n) else max(1.0, bucket.wait_s)
+            return 0.0 if bucket.take(n) else max(1.0, bucket.wait_s(n))

@@ -112,14 +112,14 @@ class Sign(_Said):
 
 
 class Preview(_Said):
-    """The operator asks to see how a version will look, before they arm it."""
+    """The operator, at the instrument, asks to see how a version will look, before they arm it."""
 
     kind: Literal["preview"] = "preview"
     version: int
 
 
 class Arm(_Said):
-    """The operator confirms what the preview showed."""
+    """The operator, at the instrument, confirms what the preview showed."""
 
     kind: Literal["arm"] = "arm"
     version: int
@@ -182,4 +182,4 @@ class Op(_Said):
 
 DARK = ("stop",)
 #: what only somebody standing at the instrument may say
-LOCAL = ("arm", "start", "acknowledge")
+LOCAL = ("preview", "arm", "start", "acknowledge")

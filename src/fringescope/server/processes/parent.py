@@ -30,9 +30,9 @@ class Child:
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
         self._starting = asyncio.Lock()
-        self._calls: dict[int, tuple[asyncio.Future[Any], Progress]] = {}
+        self._calls: dict[int, tuple[asyncio.Future[Any], Progress, dict[str, Any]]] = {}  #: and how it was asked for
         self._number = 0
-        self._ending = False
+        self._ending = self._again = False
 
     @property
     def alive(self) -> bool:
@@ -47,8 +47,10 @@ class Child:
     async def start(self) -> None:
         """Makes sure that it runs."""
         async with self._starting:
-            if self.alive:
-                return
+            await self._start()
+
+    async def _start(self) -> None:
+        if not self.alive:
             self._ending = False
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "fringescope.server.processes.child", self._module,
@@ -65,8 +67,9 @@ class Child:
         self._number += 1
         number = self._number
         answer: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        self._calls[number] = answer, progress or (lambda _s, _x: None)
-        self.post({"id": number, "call": name, "args": args})
+        message = {"id": number, "call": name, "args": args}
+        self._calls[number] = answer, progress or (lambda _s, _x: None), message
+        self.post(message)
         try:
             return await answer
         except asyncio.CancelledError:
@@ -81,6 +84,24 @@ class Child:
         if p is not None and p.stdin is not None and p.returncode is None and not p.stdin.is_closing():
             with contextlib.suppress(OSError, RuntimeError):
                 p.stdin.write(json.dumps(message, allow_nan=False).encode() + b"\n")
+
+    async def restart(self) -> None:
+        """Ends what it does, at once, for a call that nobody waits for any more; the others are begun anew."""
+        async with self._starting:
+            if self._process is None or not self.alive:
+                return
+            self._again = True
+            try:
+                with contextlib.suppress(ProcessLookupError):
+                    self._process.kill()
+                await self._ended()
+            finally:
+                self._again = False
+            waiting = [message for answer, _, message in self._calls.values() if not answer.done()]
+            if waiting and not self._ending:
+                await self._start()
+                for message in waiting:
+                    self.post(message)
 
     async def kill(self) -> None:
         """Ends it at once; whoever waits for it hears that the work was cancelled."""
@@ -119,15 +140,17 @@ class Child:
             elif "id" in message:
                 self._answer(message)
         await process.wait()
+        if self._again:
+            return
         why = "cancelled" if self._ending else f"the {self._module.rsplit('.', 1)[-1]}'s process ended; try again"
-        for answer, _ in self._calls.values():
+        for answer, _, _ in self._calls.values():
             if not answer.done():
                 answer.set_exception(DeviceLostError(why))
         if not self._ending:
             self._lost()
 
     def _answer(self, message: dict[str, Any]) -> None:
-        answer, progress = self._calls.get(message["id"], (None, None))
+        answer, progress, _ = self._calls.get(message["id"], (None, None, None))
         if answer is None or progress is None or answer.done():
             return
         if "progress" in message:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
+import sqlalchemy as sa
 from fastapi import APIRouter, HTTPException, Query, Request
 from starlette.concurrency import run_in_threadpool
 
@@ -12,7 +14,7 @@ from fringescope.server import database as db
 from fringescope.server import invitations as invited
 from fringescope.server import journal, truth
 from fringescope.server.accounts import new_id
-from fringescope.server.asking import CaseId, Who, problems, size_of
+from fringescope.server.asking import CaseId, Who, problems, still
 from fringescope.server.hub import as_event
 from fringescope.server.rights import MAY
 from fringescope.wire import Case, CaseList, Invitation, Op, Person, PersonRole, Status
@@ -131,13 +133,23 @@ async def say(case: CaseId, ops: list[Op], who: Who, request: Request) -> list[S
         raise HTTPException(413, f"{len(ops)} ops at once; at most 1000 are taken")
     stops = who.site.hub.can_stop(case)  # a stop of something that is armed or lit is never too often
     counted = [op for op in ops if not (stops and op.what.kind == "stop")]
-    who.say_so_many(len(counted) - 1 + size_of(len(await request.body())) if counted else 0)
-    out = []
+    if counted:
+        who.say_so_many(len(counted), len(await request.body()))
+    out: list[Said] = []
     for op in ops:
         if op.what.kind == "carry_over":
             raise HTTPException(422, "carry_over: use the route of that name, which looks the job up")
+        if out and not await run_in_threadpool(still, who, case):
+            raise HTTPException(403, "your right to see this case has ended; what you said before that is written down")
         out.append(await who.site.hub.say(case, who.speaker, op))
     return out
+
+
+async def _invited(who: Who, case: str, told: dict[str, Any], beside: Callable[[sa.Connection], None]) -> None:
+    """Writes down that somebody was invited, and `beside` with it. Raises 409 or 507 where nothing came of it."""
+    said = await who.site.hub.note(case, who.speaker.person, who.speaker.role.value, "invited", told, beside)
+    if said.refused:
+        raise HTTPException(409 if said.seq else 507, said.refused)
 
 
 @router.get("/{case}/members", responses=problems(401, 403, 404))
@@ -158,12 +170,7 @@ async def let_in(case: CaseId, person: str, who: Who) -> Person:
     if who.site.accounts.case_of(person) not in (None, case):
         raise HTTPException(409, "a guest sees the one case of their invitation; invite them to this one, too")
     if not await run_in_threadpool(kept.is_member, who.site.engine, case, person):
-        said = await who.site.hub.note(
-            case, who.speaker.person, who.speaker.role.value, "invited", {"person": person},
-            lambda c: kept.let_in(c, case, person),
-        )  # fmt: skip
-        if said.refused:
-            raise HTTPException(409 if said.seq else 507, said.refused)
+        await _invited(who, case, {"person": person}, lambda c: kept.let_in(c, case, person))
     return known
 
 
@@ -173,13 +180,14 @@ async def let_out(case: CaseId, person: str, who: Who) -> Ended:
     await run_in_threadpool(who.case, case, "case.invite")
     if not await run_in_threadpool(kept.is_member, who.site.engine, case, person):
         raise HTTPException(404, "they were not let into this case")
+    who.site.rooms.expel(person, case)  # nothing of theirs comes behind the word that they are out
     said = await who.site.hub.note(
         case, who.speaker.person, who.speaker.role.value, "revoked", {"person": person},
         lambda c: kept.let_out(c, case, person),
     )  # fmt: skip
     if said.seq is None:
         raise HTTPException(507, said.refused)
-    who.site.rooms.expel(person, case)
+    who.site.rooms.expel(person, case)  # who came back meanwhile
     return Ended()
 
 
@@ -196,12 +204,7 @@ async def invite(case: CaseId, asked: NewInvitation, who: Who) -> Invitation:
     await run_in_threadpool(who.case, case, "case.invite")
     made, row = await run_in_threadpool(who.site.invitations.make, case, who.speaker.person, asked)
     told = {"invitation": made.id, "role": asked.role, "expires_ns": made.expires_ns}
-    said = await who.site.hub.note(
-        case, who.speaker.person, who.speaker.role.value, "invited", told,
-        lambda c: invited.keep(c, row),
-    )  # fmt: skip
-    if said.refused:
-        raise HTTPException(409 if said.seq else 507, said.refused)
+    await _invited(who, case, told, lambda c: invited.keep(c, row))
     return made
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -50,26 +50,39 @@ async def bundle(
     found = await run_in_threadpool(kept.get, who.site.engine, case, patient)
     if found is None:
         raise HTTPException(404, "there is no such case")
+    taking, person, most = who.site.leaving.taking, who.speaker.person, who.site.config.limits.bundles_each
+    if taking[person] >= most:
+        raise HTTPException(429, f"you are taking {most} bundles already; wait until one of them has come")
+    taking[person] += 1
     folder = Path(tempfile.mkdtemp(dir=_work(who), prefix="bundle-"))
+
+    def over() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        taking[person] -= 1
+
     try:
         file = await who.site.leaving.bundle(found, found.patient, folder)
     except BaseException as e:
-        shutil.rmtree(folder, ignore_errors=True)
+        over()
         if isinstance(e, UsageError):
             raise HTTPException(410, str(e)) from None
         raise
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", found.specimen.pseudonym or found.accession).strip("-.") or "case"
-    return _Passing(file, media_type=ZIP, filename=f"{name[:60]}-{case[-6:]}.zip")
+    passing = _Passing(file, media_type=ZIP, filename=f"{name[:60]}-{case[-6:]}.zip")
+    passing.over = over
+    return passing
 
 
 class _Passing(FileResponse):
     """A file whose folder goes when it was sent, or when nobody takes it."""
 
+    over: Callable[[], None]
+
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
-            shutil.rmtree(Path(self.path).parent, ignore_errors=True)
+            self.over()
 
 
 def _work(who: Who) -> Path:
@@ -142,7 +155,7 @@ async def add_scan(
                 shutil.rmtree(file.parent, ignore_errors=True)
 
         try:
-            return who.site.jobs.begin("add scan", case, who.speaker.person, add)
+            return await who.site.jobs.begin("add scan", case, who.speaker.person, add)
         except UsageError as e:
             raise HTTPException(409, str(e)) from None
 

@@ -7,6 +7,7 @@ import base64
 import contextlib
 import json
 import logging
+import re
 import time
 from typing import Any
 
@@ -28,6 +29,7 @@ from fringescope.wire.room import CaughtUp, FromClient, Ping, Pong, Refusal, Rel
 
 router = APIRouter()
 _MESSAGE: TypeAdapter[Any] = TypeAdapter(FromClient)
+_CASE = re.compile(r"case-[0-9a-f]{20}")
 _PAGE = 500
 _LOG = logging.getLogger("fringescope.room")
 _PARTING_S = 30.0  #: so long a browser may take until it reads why it was let go
@@ -36,6 +38,7 @@ _PARTING_S = 30.0  #: so long a browser may take until it reads why it was let g
 async def _enter(socket: WebSocket, case: str, what: str) -> Asking | None:
     """Who comes in, or None after the door was closed with a reason."""
     site = socket.app.state.site
+    case = case if _CASE.fullmatch(case) else "none"
     if not origin_fits(socket.scope, site.config):
         await _close(socket, 4403, "this connection comes from another site's page; open the hub's own page")
         return None
@@ -139,7 +142,7 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             text = message.get("text")
             if listener.ended is not None:  # while this message was on its way
                 return
-            if not every.take():
+            if not every.take(size_of(len(text or message.get("bytes") or ""))):
                 listener.end(FLOOD)
                 return
             if not site.accounts.allowed(asking.speaker.person):
@@ -160,7 +163,7 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
             if isinstance(said, Ping):
                 listener.send(Pong(at_ms=said.at_ms).model_dump_json())
             elif isinstance(said, Say):
-                await _say(asking, case, listener, said, waiting, size_of(len(text)))
+                await _say(asking, case, listener, said, waiting, len(text))
             elif (why := refusal(asking.speaker, said.type)) or not live.take():
                 if why:
                     listener.send(_refused(why))
@@ -181,8 +184,8 @@ async def _say(
     def refuse(why: str) -> None:
         listener.send(Said(client=op.client, number=op.number, seq=None, refused=why).model_dump_json())
 
-    if not (what == "stop" and asking.site.hub.can_stop(case)) and asking.site.ops.take(asking.speaker.person, size):
-        refuse("too many ops; wait a moment and say it again")
+    if not (what == "stop" and asking.site.hub.can_stop(case)) and (why := asking.too_much(1, size)[0]):
+        refuse(why)
         return
     if what == "carry_over":
         refuse("carry_over: use the route of that name, which looks the job up")
@@ -190,7 +193,9 @@ async def _say(
 
     async def answer() -> None:
         try:
-            listener.send((await asking.site.hub.say(case, await _fresh(asking, what), op)).model_dump_json())
+            who = await _fresh(asking, what)
+            if listener.ended is None:  # else they were let go meanwhile: nothing of theirs comes behind that
+                listener.send((await asking.site.hub.say(case, who, op)).model_dump_json())
         except FringescopeError as e:
             refuse(str(e))
 
@@ -229,6 +234,7 @@ def _why(e: ValidationError) -> str:
 
 # -------------------------------------------------------------------------------------------------------------- video
 
+_LATE_ACKS = 100  #: other words than the acknowledgement that are passed over
 QUALITIES = ((640, 50), (960, 60), (1280, 70), (1920, 80))  #: widths and JPEG qualities, from a poor line to a good one
 
 
@@ -243,11 +249,23 @@ async def video(socket: WebSocket, case: str, camera: str) -> None:
     if asking is None:
         return
     site = asking.site
-    if site.instrument.watching >= site.config.limits.videos:
-        await _close(socket, 1013, "too many watch already; try again later")
+    limits, watching, person = site.config.limits, site.instrument.watching, asking.speaker.person
+    if watching.total() >= limits.videos or watching[person] >= limits.videos_each:
+        each = watching[person] >= limits.videos_each
+        why = f"you watch {watching[person]} streams already; close one" if each else "too many watch already"
+        await _close(socket, 1013, f"{why}; try again later")
         return
-    await socket.accept()
-    site.instrument.watching += 1
+    watching[person] += 1
+    try:
+        await socket.accept()
+        await _film(socket, asking, case, camera)
+    finally:
+        watching[person] -= 1
+
+
+async def _film(socket: WebSocket, asking: Asking, case: str, camera: str) -> None:
+    """One frame after the other, as long as they are acknowledged and the person may see them."""
+    site = asking.site
     level, number = 1, 0
     try:
         while await run_in_threadpool(still, asking, case):
@@ -266,15 +284,16 @@ async def video(socket: WebSocket, case: str, camera: str) -> None:
             begun = time.monotonic()
             await socket.send_text(json.dumps(told))
             await socket.send_bytes(data)
-            while True:
-                answer = json.loads(await asyncio.wait_for(socket.receive_text(), 30))
-                if isinstance(answer, dict) and answer.get("ack") == number:
-                    break
+            async with asyncio.timeout(30):
+                for _ in range(_LATE_ACKS):
+                    answer = json.loads(await socket.receive_text())
+                    if isinstance(answer, dict) and answer.get("ack") == number:
+                        break
+                else:
+                    raise ValueError("nothing but other words")
             took = 1000 * (time.monotonic() - begun)
             level = max(0, level - 1) if took > 250 else min(len(QUALITIES) - 1, level + 1) if took < 60 else level
         await socket.close(*EXPELLED)
-    except (WebSocketDisconnect, TimeoutError, ValueError, RuntimeError):
+    except (WebSocketDisconnect, TimeoutError, ValueError, KeyError, RuntimeError):  # KeyError: bytes, no text
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(1000)
-    finally:
-        site.instrument.watching -= 1

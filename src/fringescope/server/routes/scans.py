@@ -32,15 +32,15 @@ def scans(case: CaseId, who: Who) -> list[ScanInfo]:
 
 @router.post("/cases/{case}/scans", status_code=202, tags=["scans"], responses=problems(401, 403, 404, 409))
 async def scan(case: CaseId, asked: NewScan, who: Who) -> Job:
-    """Takes a scan, as a job."""
+    """Takes a scan, as a job: for the operator at the instrument, it projects fringes."""
     await run_in_threadpool(who.case, case, "scan.take")
-    return _begin(who, "scan", case, lambda tell: who.site.lab.scan(case, asked.label, tell))
+    return await _begin(who, "scan", case, lambda tell: who.site.lab.scan(case, asked.label, tell))
 
 
-def _begin(who: Who, kind: str, case: str | None, work: Work) -> Job:
+async def _begin(who: Who, kind: str, case: str | None, work: Work) -> Job:
     """A job, or 409 where too many wait."""
     try:
-        return who.site.jobs.begin(kind, case, who.speaker.person, work)
+        return await who.site.jobs.begin(kind, case, who.speaker.person, work)
     except UsageError as e:
         raise HTTPException(409, str(e)) from None
 
@@ -49,7 +49,7 @@ def _begin(who: Who, kind: str, case: str | None, work: Work) -> Job:
 async def carry(case: CaseId, asked: AskedCarry, who: Who) -> Job:
     """Lays the strokes of a stale version on the present scan, as a job: for the operator to look at."""
     await run_in_threadpool(who.case, case, "carry_over")
-    return _begin(who, "carry", case, lambda tell: who.site.lab.carry(case, asked.version, tell))
+    return await _begin(who, "carry", case, lambda tell: who.site.lab.carry(case, asked.version, tell))
 
 
 @router.post("/cases/{case}/carry_over", tags=["scans"], responses=problems(400, 401, 403, 404))
@@ -69,8 +69,8 @@ async def carry_over(case: CaseId, op: Op, who: Who) -> Said:
 @router.post("/cases/{case}/compare", status_code=202, tags=["scans"], responses=problems(401, 403, 404, 409))
 async def compare(case: CaseId, asked: AskedCompare, who: Who) -> Job:
     """What was cut from one scan of a case to another, as a job; its maps and figures go into the case."""
-    await run_in_threadpool(who.case, case, "scan.take")
-    return _begin(
+    await run_in_threadpool(who.case, case, "scan.compare")
+    return await _begin(
         who, "compare", case,
         lambda tell: who.site.lab.compare(case, asked.before, asked.after, asked.version, tell),
     )  # fmt: skip
@@ -169,14 +169,14 @@ async def stop(who: Who) -> Ended:
 async def pose(asked: NewPose, who: Who) -> Job:
     """Photographs the calibration board where it lies now, as a job; the first pose says which board it is."""
     who.must("instrument.calibrate")
-    return _begin(who, "pose", None, lambda tell: who.site.lab.pose(asked.board, tell))
+    return await _begin(who, "pose", None, lambda tell: who.site.lab.pose(asked.board, tell))
 
 
 @router.post("/instrument/calibrate", status_code=202, tags=["instrument"], responses=problems(401, 403, 409))
 async def calibrate(who: Who) -> Job:
     """The poses so far to a rig, as a job; scans are made with it from then on."""
     who.must("instrument.calibrate")
-    return _begin(who, "calibrate", None, who.site.lab.calibrate)
+    return await _begin(who, "calibrate", None, who.site.lab.calibrate)
 
 
 @router.post("/instrument/simulate", tags=["instrument"], responses=problems(401, 409))
