@@ -76,16 +76,18 @@ def scan_view(view: ViewInput, rig: Rig, s: Settings, *, device: Device = "cpu")
     """
     check_device(device)
     geometry.check_baseline(rig, rig.camera(view.plan.camera))
-    return _scanned(*arrival.gathered(view, rig, s), rig, s, device)  # frames may still be arriving
+    return scan_gathered(*arrival.gathered(view, rig, s), rig, s, device)  # frames may still be arriving
 
 
-def _scanned(
+def scan_gathered(
     view: ViewInput, begun: fast.Begun | None, rig: Rig, s: Settings, device: Device
 ) -> tuple[Decoded, Grid]:
-    """See `scan_view`."""
+    """As `scan_view`, of a view as `arrival.gathered` gives it; frames that were gathered for it are let go of."""
     fused = fast.decode(view, rig, s, device, begun)  # the same in one pass, for the usual plans
     if fused is not None:
         decoded, xyz, sigma, steps = fused
+        if begun is not None and isinstance(view.frames, list):
+            view.frames.clear()  # they were gathered for this view alone: their memory serves the masks
         tiles = denoise.Tiles(decoded, (steps,))
         reasons = _masked(decoded, decoded.reasons, rig, s, tiles)
         grid = triangulate.blanked(xyz, sigma, reasons, rig, decoded.camera)
@@ -398,7 +400,7 @@ def scan(
             come = arrival.held(come)
             _show_early(early, [come], len(views), first)
         start = perf_counter()
-        decoded, grid = _scanned(come, begun, rig, s, device)
+        decoded, grid = scan_gathered(come, begun, rig, s, device)
         return decoded, grid, picture(come, decoded, s), pictures.taken(come, decoded), perf_counter() - start
 
     with arrival.each(one, views, rig, at_once=device == "cpu" and first is None) as made:

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
+from time import perf_counter
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -32,16 +33,22 @@ def is_here(view: ViewInput) -> bool:
     return isinstance(view.frames, list | tuple)
 
 
-def gathered(view: ViewInput, rig: Rig, s: Settings) -> tuple[ViewInput, fast.Begun | None]:
+def gathered(
+    view: ViewInput, rig: Rig, s: Settings, *, by_frame: bool = True
+) -> tuple[ViewInput, fast.Begun | None]:
     """A view with its frames in memory, and what was worked out while they came; one that goes the stages' way as it
-    is, since they take frames one by one. Raises CaptureError for more frames than the plan has, or one in another's
-    memory, and what the frames raise.
+    is, since they take frames one by one. The frames are taken in a thread of their own. Those of the finest set are
+    summed one by one while there is nothing else to do, unless `by_frame` is false; results are the same. Raises
+    CaptureError for more frames than the plan has, or one in another's memory, and what the frames raise.
     """
     if is_here(view) or not fast.takes(view):
         return view, None
+    if not isinstance(view.frames, Arriving):
+        with Reader([view]) as reader:
+            return gathered(reader.view(0), rig, s, by_frame=by_frame)
     beginning, most = fast.Beginning(view, rig, s), len(view.plan.keys)
     for key, frame in view.frames:
-        beginning.add(key, frame)
+        beginning.add(key, frame, view.frames.room_s if by_frame else 0.0)
         if len(beginning.frames) > most:
             raise CaptureError(
                 f"view '{view.plan.camera}': more than the plan's {most} frames came; needed each once: one came "
@@ -74,6 +81,31 @@ def each(
             yield (work(reader.view(n)) for n in range(len(views)))
 
 
+class Arriving:
+    """The frames of a view as they come, to be iterated once; they raise what their source raises."""
+
+    def __init__(self) -> None:
+        self._come: queue.SimpleQueue[Arrived | BaseException | None] = queue.SimpleQueue()
+        self._last, self._between = perf_counter(), 0.0  # when one came, and after how long
+
+    @property
+    def room_s(self) -> float:
+        """Seconds between the last two frames, as a guess at the next; 0 if others have come that were not taken."""
+        return self._between if self._come.empty() else 0.0
+
+    def put(self, one: Arrived | BaseException | None) -> None:
+        """A frame has come, or an error; None: all have."""
+        now = perf_counter()
+        self._between, self._last = now - self._last, now
+        self._come.put(one)
+
+    def __iter__(self) -> Iterator[Arrived]:
+        while (one := self._come.get()) is not None:
+            if isinstance(one, BaseException):
+                raise one
+            yield one
+
+
 class Reader:
     """Takes the frames of views, one view after the other, in a thread of its own, so that whoever yields them need not
     wait for those who work on them. `with reader:`, and `view` for each in its order: when one is asked for, the next
@@ -82,7 +114,7 @@ class Reader:
 
     def __init__(self, views: Sequence[ViewInput]) -> None:
         self._views = views
-        self._queues: list[queue.SimpleQueue[Arrived | BaseException | None]] = [queue.SimpleQueue() for _ in views]
+        self._come = [Arriving() for _ in views]
         self._room = threading.Semaphore(AHEAD)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -95,13 +127,7 @@ class Reader:
         view = self._views[n]
         if n and not is_here(self._views[n - 1]):
             self._room.release()
-        return view if is_here(view) else replace(view, frames=self._frames(n))
-
-    def _frames(self, n: int) -> Iterator[Arrived]:
-        while (one := self._queues[n].get()) is not None:
-            if isinstance(one, BaseException):
-                raise one
-            yield one
+        return view if is_here(view) else replace(view, frames=self._come[n])
 
     def _read(self) -> None:
         for n, view in enumerate(self._views):
@@ -109,13 +135,13 @@ class Reader:
                 continue
             self._room.acquire()
             try:
-                self._pass_on(view, self._queues[n].put)
+                self._pass_on(view, self._come[n].put)
             except BaseException as e:  # raised again where the frames are taken
-                self._queues[n].put(e)
+                self._come[n].put(e)
                 return
             if self._stop.is_set():
                 return
-            self._queues[n].put(None)
+            self._come[n].put(None)
 
     def _pass_on(self, view: ViewInput, put: Callable[[Arrived], None]) -> None:
         source = iter(view.frames)

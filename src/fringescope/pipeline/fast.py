@@ -10,13 +10,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from time import perf_counter
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fringescope import denoise, geometry, memory, phase
 from fringescope.errors import CaptureError, RigError
 from fringescope.kernels import fused as k
+from fringescope.kernels import running
 from fringescope.kernels.depths import Depths
 from fringescope.settings import Settings
 from fringescope.types import (
@@ -61,6 +64,16 @@ class Way:
     usual: F64  #: (8, 8)
 
 
+@dataclass(eq=False)
+class Summed:
+    """Frames of the finest set that lie in sums already: the first ones of it, never all."""
+
+    pivot: float  #: taken off every sample
+    kind: int  #: see `kernels.running`
+    rest: AnyArray  #: (H, bytes) of the sums that do not fit into the points
+    frames: int = 0
+
+
 class Begun(NamedTuple):
     """What the coarser sets of a view say, worked out while its finer ones were still on their way."""
 
@@ -68,6 +81,8 @@ class Begun(NamedTuple):
     noise: NoiseModel  #: that it rests on
     levels: F32  #: backgrounds, codes, at which that counts
     out: tuple[AnyArray, ...]  #: the outputs of the kernel, which hold it
+    few: list[tuple[FrameKey, AnyArray]]  #: every n-th pixel of the frames, for statistics
+    summed: Summed | None  #: of the finest set; used up by `decode`
 
 
 class Fused(NamedTuple):
@@ -88,7 +103,7 @@ def decode(
     `view.frames` must be a sequence, unless `takes` refuses the view. What was `begun` is gone on from, if it rests on
     what all frames say. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
     """
-    way = way_of(view, rig, s)
+    way = way_of(view, rig, s, begun.few if begun is not None else None)
     if way is None:
         return None
     H, W = _size(way.frames[0])
@@ -102,7 +117,10 @@ def decode(
         frames = [phase.unpacked(f, view.plan.pixel_format) for f in way.frames]
         gpu.by_slabs(frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
     else:
-        on_cpu(way, out, begun.sets if begun is not None and _still_holds(begun, way, s) else 0)
+        good = begun if begun is not None and _still_holds(begun, way, s) else None
+        on_cpu(way, out, good.sets if good is not None else 0, summed=good.summed if good is not None else None)
+    if begun is not None and begun.summed is not None:
+        begun.summed.frames, begun.summed.rest = 0, NO_REST  # its memory serves the masks
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -156,9 +174,14 @@ class Beginning:
         self._way: Way | None = None
         self._levels = np.zeros(0, np.float32)
         self._out: tuple[AnyArray, ...] = ()
+        self._few: list[tuple[FrameKey, AnyArray]] = []
+        self._summed: Summed | None = None
+        self._sum_s = 0.0  # that it took to add to the sums
 
-    def add(self, key: FrameKey, frame: AnyArray) -> None:
-        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it.
+    def add(self, key: FrameKey, frame: AnyArray, room_s: float = math.inf) -> None:
+        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it. A frame of
+        the finest set is added to its sums, with those that have not been yet, if that takes less than `room_s`, the
+        seconds until the next one may come.
 
         Raises CaptureError for a frame in the memory of another.
         """
@@ -168,6 +191,10 @@ class Beginning:
                 "needed frames that stay as they are: copy each one as it comes"
             )
         self.frames.append((key, frame))
+        if frame.ndim == 2 or self._view.plan.pixel_format.packs(frame):
+            every = denoise.odd_stride(math.prod(_size(frame)))
+            few = phase.thinned(frame, self._view.plan.pixel_format, every)
+            self._few.append((key, np.ascontiguousarray(few)))
         while self._done < len(self._family) - 1 and len(self.frames) < len(self._view.plan.keys):
             got = _in_order(replace(self._view, frames=self.frames), self._family, self._done + 1)
             if got is None:
@@ -182,6 +209,32 @@ class Beginning:
             self._way = replace(self._way, frames=got)
             on_cpu(self._way, self._out, self._done, self._done + 1)
             self._done += 1
+        if self._way is not None and self._done == len(self._family) - 1 and self._sum_s < room_s:
+            start = perf_counter()
+            self._sum_up(self._way)
+            self._sum_s = perf_counter() - start
+
+    def _sum_up(self, way: Way) -> None:
+        """Add what has come of the finest set, in the order of its frames, to the sums; its last frame is left."""
+        n, steps = self._family[-1][0], int(way.sets.start[-1] - way.sets.start[-2])
+        done = self._summed.frames if self._summed is not None else 0
+        there = {key.number: f for key, f in self.frames if key.set_index == n}
+        frames: list[AnyArray] = []
+        while done + len(frames) < steps - 1 and done + len(frames) in there:
+            frames.append(there[done + len(frames)])
+        like = way.frames[0]
+        if not frames or any(f.shape != like.shape or f.dtype != like.dtype for f in frames):
+            return
+        if self._summed is None:
+            kind, size = running.kind_of(steps, bool(way.sets.plain[-1]), way.sets.top)
+            H, W = _size(like)
+            rest = memory.empty((H, W * max(0, size - running.POINT_BYTES)), np.uint8)
+            self._summed = Summed(float(way.sets.pivot), kind, rest)
+        begin = int(way.sets.start[-2]) + done
+        held, addresses, row_bytes = _places(frames, int(way.sets.start[-1]), begin)
+        running.add(begin, begin + len(frames), done == 0, addresses, row_bytes, *_type(held[0]), way.sets,
+                    self._summed.kind, self._out[5], self._summed.rest, self._out[4])  # fmt: skip
+        self._summed.frames += len(frames)
 
     @property
     def begun(self) -> Begun | None:
@@ -189,7 +242,7 @@ class Beginning:
         way = self._way
         if way is None:
             return None
-        return Begun(self._done, way.noise, self._levels, self._out)
+        return Begun(self._done, way.noise, self._levels, self._out, self._few, self._summed)
 
 
 def _room(H: int, W: int) -> tuple[AnyArray, ...]:
@@ -226,16 +279,15 @@ def _first_way(
         return None
     alone = replace(plan, sets=(plan.sets[family[0][0]],))
 
-    def measured(samples: int) -> Decoded:
+    def thin(samples: int) -> list[tuple[FrameKey, AnyArray]]:
         every = denoise.odd_stride(H * W, samples)
-        thin = [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
-        return phase.measure(thin, alone, s.phase, view.noise)
+        return [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
 
-    few = measured(FIRST_SAMPLES)
+    few = phase.measure(thin(FIRST_SAMPLES), alone, s.phase, view.noise)
     steps = [_fringes(plan, n).steps for n, _ in family]
     limits = _limits(few.noise, plan.pixel_format, steps, math.inf, 0.0, s.phase.systematic_rad, s)
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
-    sets = _sets(family, steps, plan.pixel_format, measured(denoise.FEW).background)
+    sets = _sets(family, steps, plan.pixel_format, thin(denoise.FEW))
     levels = np.quantile(few.background, (0.1, 0.5, 0.9)).astype(np.float32)
     way = Way(
         frames, g, few.noise, (), table, sets, limits, _depths(table, rig, camera, s), bounds, np.ones((2, 2)),
@@ -243,8 +295,12 @@ def _first_way(
     return way, levels
 
 
-def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
-    """What the kernel needs to know of a view; None for one that it does not take."""
+def way_of(
+    view: ViewInput, rig: Rig, s: Settings, few_frames: Sequence[tuple[FrameKey, AnyArray]] | None = None
+) -> Way | None:
+    """What the kernel needs to know of a view; None for one that it does not take. `few_frames`: its frames thinned, if
+    they are already.
+    """
     plan, camera = view.plan, rig.camera(view.plan.camera)
     family = _parallel(plan) if takes(view) else None
     frames = _in_order(view, family) if family else None
@@ -256,7 +312,7 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
     numbers, g = [n for n, _ in family], family[-1][1]
     steps = [_fringes(plan, n).steps for n in numbers]
     every = denoise.odd_stride(H * W)
-    thin = [(key, phase.thinned(f, plan.pixel_format, every)) for key, f in view.frames]
+    thin = few_frames or [(key, phase.thinned(f, plan.pixel_format, every)) for key, f in view.frames]
     few = phase.measure(thin, plan, s.phase, view.noise)
     if few.background is not few.sets[numbers[-1]].background:
         return None  # the finest set is not the most accurate one
@@ -267,15 +323,18 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
     fmt = plan.pixel_format
     dark, low = denoise.weak(few, fmt, s.denoise)
     sigma_rad, contrast, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
-    sets = _sets(family, steps, fmt, few.sets[numbers[0]].background)
+    sets = _sets(family, steps, fmt, [(key, f) for key, f in thin if key.set_index == numbers[0]])
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
     limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
     depths = _depths(table, rig, camera, s)
     return Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
-def _sets(family: Family, steps: Sequence[int], fmt: PixelFormat, background: F32) -> k.Sets:
-    """The sets as the kernel has them; `background`: some of the coarsest one's."""
+def _sets(
+    family: Family, steps: Sequence[int], fmt: PixelFormat, coarsest: Sequence[tuple[FrameKey, AnyArray]]
+) -> k.Sets:
+    """The sets as the kernel has them; `coarsest`: some pixels of the frames of that set."""
+    usual = np.median(np.mean([f for _, f in coarsest], axis=0, dtype=np.float64)) if fmt.bits > 10 else 0.0
     g = family[-1][1]
     angles = np.concatenate([TWO_PI * np.arange(n) / n for n in steps])
     signs = np.repeat([1.0 if np.dot(h, g) > 0 else -1.0 for _, h in family], steps)  # of sets that point the other way
@@ -288,7 +347,7 @@ def _sets(family: Family, steps: Sequence[int], fmt: PixelFormat, background: F3
         frequency,
         np.array([np.dot(h, g) > 0 for _, h in family]),
         fmt.max_value,
-        f4(np.median(background) if fmt.bits > 10 else 0.0),
+        f4(round(float(usual))),  # whole, so that differences are exact
     )
 
 
@@ -382,16 +441,39 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
     )
 
 
-def on_cpu(way: Way, out: tuple[AnyArray, ...], begin: int = 0, end: int | None = None) -> None:
+NO_REST = np.zeros((0, 0), np.uint8)
+
+
+def on_cpu(
+    way: Way, out: tuple[AnyArray, ...], begin: int = 0, end: int | None = None, summed: Summed | None = None
+) -> None:
     """Runs the kernel over rows on all cores, on sets `begin` .. `end` - 1; it reads the frames where they lie, packed
-    ones too. Frames of later sets may be missing.
+    ones too. Frames of later sets may be missing. `summed`: what was begun of the last set, if all others are done.
     """
-    frames = [f if f[0].flags.c_contiguous else np.ascontiguousarray(f) for f in way.frames]
-    addresses, row_bytes = np.zeros(way.sets.start[-1], np.int64), np.zeros(way.sets.start[-1], np.int64)
-    addresses[: len(frames)] = [f.ctypes.data for f in frames]
-    row_bytes[: len(frames)] = [f.strides[0] for f in frames]
-    packed = frames[0].ndim == 3
-    like = np.empty(0, np.uint16 if packed else frames[0].dtype)
+    held, addresses, row_bytes = _places(way.frames, int(way.sets.start[-1]))
     last = len(way.sets.frequency) if end is None else end
-    k.decode(begin, last, addresses, row_bytes, like, packed, way.sets, way.limits, way.bounds, way.usual, way.depths,
-             *out)  # fmt: skip
+    count, kind, rest = 0, running.FLOATS, NO_REST
+    if summed is not None and begin == last - 1 > 0 and summed.pivot == way.sets.pivot:
+        count, kind, rest = summed.frames, summed.kind, summed.rest
+    k.decode(begin, last, addresses, row_bytes, *_type(held[0]), way.sets, way.limits, way.bounds, way.usual,
+             way.depths, count, kind, rest, *out)  # fmt: skip
+
+
+def _places(
+    frames: Sequence[AnyArray], count: int, begin: int = 0
+) -> tuple[list[AnyArray], NDArray[np.int64], NDArray[np.int64]]:
+    """Frames whose samples follow each other within a row; of `count` frames, whose first `begin` ones and last ones
+    may be missing, where they lie and how far apart their rows are. Who uses the addresses holds the frames.
+    """
+    held = [f if f[0].flags.c_contiguous else np.ascontiguousarray(f) for f in frames]
+    addresses, row_bytes = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    there = slice(begin, begin + len(held))
+    addresses[there] = [f.ctypes.data for f in held]
+    row_bytes[there] = [f.strides[0] for f in held]
+    return held, addresses, row_bytes
+
+
+def _type(frame: AnyArray) -> tuple[AnyArray, bool]:
+    """An array of the samples' type, and whether they are packed."""
+    packed = frame.ndim == 3
+    return np.empty(0, np.uint16 if packed else frame.dtype), packed
