@@ -15,10 +15,11 @@ from typing import Self, TypeVar
 
 from fringescope import memory
 from fringescope.errors import CaptureError, ResourceError
-from fringescope.pipeline import fast
+from fringescope.pipeline import fast, tiling
+from fringescope.pipeline.tiling import ByRows
 from fringescope.settings import Settings
 from fringescope.threads import WORKERS
-from fringescope.types import AnyArray, FrameKey, PixelFormat, Rig, ViewInput
+from fringescope.types import AnyArray, FrameKey, PixelFormat, Rig, RowFrames, ViewInput
 
 T = TypeVar("T")
 AHEAD = 2  #: views whose frames are held at most: that which is worked on, and the next
@@ -33,6 +34,11 @@ def is_here(view: ViewInput) -> bool:
     return isinstance(view.frames, list | tuple)
 
 
+def is_ready(view: ViewInput) -> bool:
+    """Whether nobody has to take the frames of a view as they come: they lie in memory, or stay where they are."""
+    return is_here(view) or isinstance(view.frames, ByRows)
+
+
 def gathered(
     view: ViewInput, rig: Rig, s: Settings, *, by_frame: bool = True
 ) -> tuple[ViewInput, fast.Begun | None]:
@@ -41,7 +47,7 @@ def gathered(
     summed one by one while there is nothing else to do, unless `by_frame` is false; results are the same. Raises
     CaptureError for more frames than the plan has, or one in another's memory, and what the frames raise.
     """
-    if is_here(view) or not fast.takes(view):
+    if is_ready(view) or not fast.takes(view):
         return view, None
     if not isinstance(view.frames, Arriving):
         with Reader([view]) as reader:
@@ -58,8 +64,8 @@ def gathered(
 
 
 def held(view: ViewInput) -> ViewInput:
-    """A view with its frames in memory."""
-    return view if is_here(view) else replace(view, frames=list(view.frames))
+    """A view with its frames in memory, unless they are not to be."""
+    return view if is_ready(view) else replace(view, frames=list(view.frames))
 
 
 LITTLE = 1_000_000  #: pixels of pictures that leave cores idle
@@ -118,20 +124,20 @@ class Reader:
         self._room = threading.Semaphore(AHEAD)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        if not all(map(is_here, views)):
+        if not all(map(is_ready, views)):
             self._thread = threading.Thread(target=self._read, name="frames", daemon=True)
             self._thread.start()
 
     def view(self, n: int) -> ViewInput:
         """View n with its frames as they come, to be iterated once; they raise what their source raises."""
         view = self._views[n]
-        if n and not is_here(self._views[n - 1]):
+        if n and not is_ready(self._views[n - 1]):
             self._room.release()
-        return view if is_here(view) else replace(view, frames=self._come[n])
+        return view if is_ready(view) else replace(view, frames=self._come[n])
 
     def _read(self) -> None:
         for n, view in enumerate(self._views):
-            if is_here(view):
+            if is_ready(view):
                 continue
             self._room.acquire()
             try:
@@ -173,19 +179,43 @@ def _bytes_of(view: ViewInput) -> int:
 
 
 VIEW_BYTES, KEPT_BYTES, CLOUD_BYTES = 45, 31, 20  #: a pixel: while its view is scanned, kept of it, of the cloud
+SLACK = 16 << 20  #: bytes: what the blocks of `memory` are larger than their arrays
+ONE_FRAME = 3  #: times its bytes: while a frame is read, its file and what is made of it
 
 
-def check_memory(views: Sequence[ViewInput], rig: Rig) -> None:
-    """Raise ResourceError if the machine has too little memory left for a scan of these views."""
-    free = memory.available()
+def fitted(
+    views: Sequence[ViewInput], rig: Rig, budget: int | None = None, *, alone: bool = False, device: str = "cpu"
+) -> tuple[ViewInput, ...]:
+    """The views as they fit into memory for a scan: as they are, or `ByRows` where their frames may stay on a disk.
+
+    `budget`: bytes that may be used; what the machine has left, if None. `alone`: one view, for its grid. Raises
+    ResourceError, with the figures, if it is too little for what has to be in memory.
+    """
+    free = memory.available() if budget is None else budget
     if free is None or not views:
-        return
+        return tuple(views)
     lenses = [rig.camera(v.plan.camera).lens for v in views]
     pixels = [lens.width * lens.height for lens in lenses]
     frames = [0 if is_here(v) else n * _bytes_of(v) for n, v in zip(pixels, views, strict=True)]
-    need = max(n * VIEW_BYTES for n in pixels) + sum(sorted(frames)[-AHEAD:]) + sum(pixels) * (KEPT_BYTES + CLOUD_BYTES)
+    least = max(n * VIEW_BYTES for n in pixels) + (0 if alone else sum(pixels) * (KEPT_BYTES + CLOUD_BYTES))
+    need = least + sum(sorted(frames)[-AHEAD:])
+    if need <= free:
+        return tuple(views)
+    tiled = [device == "cpu" and isinstance(v.frames, RowFrames) and fast.takes(v) for v in views]
+    least += sum(sorted(0 if t else size for t, size in zip(tiled, frames, strict=True))[-AHEAD:])
+    one = max(n * ONE_FRAME * v.plan.pixel_format.dtype.itemsize for n, v in zip(pixels, views, strict=True))
+    row = [lens.width * _bytes_of(v) for lens, v in zip(lenses, views, strict=True)]
+    if any(tiled):
+        least += SLACK
+        need = least + max(one, tiling.LEAST * max(r for t, r in zip(tiled, row, strict=True) if t))
     if need > free:
+        how = ", a few rows of their frames at a time" if any(tiled) else ""
+        count = "1 view" if len(views) == 1 else f"{len(views)} views"
         raise ResourceError(
-            f"{len(views)} views, {sum(pixels) / 1e6:.1f} megapixels in all, need about {need / 1e9:.1f} GB of memory; "
+            f"{count}, {sum(pixels) / 1e6:.1f} megapixels in all, need about {need / 1e9:.1f} GB of memory{how}; "
             f"{free / 1e9:.1f} GB are free: close other programs, or scan fewer views or smaller pictures at a time"
         )
+    return tuple(
+        replace(v, frames=ByRows(v.frames, int(free - least) // r)) if t and isinstance(v.frames, RowFrames) else v
+        for v, t, r in zip(views, tiled, row, strict=True)
+    )

@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from time import perf_counter
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fringescope import denoise, geometry, memory, phase
+from fringescope import denoise, geometry, phase
 from fringescope.errors import CaptureError, RigError
 from fringescope.kernels import fused as k
-from fringescope.kernels import running
 from fringescope.kernels.depths import Depths
+from fringescope.pipeline import cores
+from fringescope.pipeline.cores import Summed, Way, by_rows, on_cpu, room, size_of
+from fringescope.pipeline.tiling import ByRows
 from fringescope.settings import Settings
 from fringescope.types import (
     F32,
-    F64,
     AnyArray,
     Camera,
     Decoded,
@@ -46,32 +46,6 @@ Family = Sequence[tuple[int, tuple[float, float]]]  #: number and gradient of ea
 MOST_ERROR_MM = 1e-4  #: of the depth table against the exact solution
 TWO_PI = 2 * np.pi
 f4 = np.float32
-
-
-@dataclass(frozen=True, eq=False)
-class Way:
-    """What the kernel needs to know of a view: its frames in the order of its sets, coarse to fine, and the tables."""
-
-    frames: tuple[AnyArray, ...]
-    g: tuple[float, float]
-    noise: NoiseModel
-    notes: tuple[str, ...]
-    table: geometry.DepthTable
-    sets: k.Sets
-    limits: k.Limits
-    depths: Depths
-    bounds: F64  #: (4, h, w) turns
-    usual: F64  #: (8, 8)
-
-
-@dataclass(eq=False)
-class Summed:
-    """Frames of the finest set that lie in sums already: the first ones of it, never all."""
-
-    pivot: float  #: taken off every sample
-    kind: int  #: see `kernels.running`
-    rest: AnyArray  #: (H, bytes) of the sums that do not fit into the points
-    frames: int = 0
 
 
 class Begun(NamedTuple):
@@ -100,14 +74,20 @@ def decode(
     """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
     in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
-    `view.frames` must be a sequence, unless `takes` refuses the view. What was `begun` is gone on from, if it rests on
-    what all frames say. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
+    `view.frames` must be a sequence, or `ByRows` on the processor, unless `takes` refuses the view. What was `begun` is
+    gone on from, if it rests on what all frames say. Points have yet to be blanked where `reasons` says so. Raises as
+    the stages do.
     """
-    way = way_of(view, rig, s, begun.few if begun is not None else None)
+    tiled = view.frames if isinstance(view.frames, ByRows) else None
+    few = begun.few if begun is not None else None
+    if tiled is not None:
+        hollow, few = tiled.looked_over(view.plan, rig.camera(view.plan.camera).lens.height)
+        view = replace(view, frames=hollow)
+    way = way_of(view, rig, s, few)
     if way is None:
         return None
-    H, W = _size(way.frames[0])
-    out = begun.out if begun is not None else _room(H, W)
+    H, W = size_of(way.frames[0])
+    out = begun.out if begun is not None else room(H, W)
     absolute, sigma, A, B, reasons, xyz, sigma_mm = out
     if device == "gpu":
         from fringescope.pipeline import gpu  # only then: Numba's CUDA is slow to import
@@ -116,11 +96,13 @@ def decode(
             return None
         frames = [phase.unpacked(f, view.plan.pixel_format) for f in way.frames]
         gpu.by_slabs(frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
+    elif tiled is not None:
+        by_rows(tiled, way, _keys(view.plan, _parallel(view.plan) or []), out)
     else:
         good = begun if begun is not None and _still_holds(begun, way, s) else None
         on_cpu(way, out, good.sets if good is not None else 0, summed=good.summed if good is not None else None)
     if begun is not None and begun.summed is not None:
-        begun.summed.frames, begun.summed.rest = 0, NO_REST  # its memory serves the masks
+        begun.summed.frames, begun.summed.rest = 0, cores.NO_REST  # its memory serves the masks
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -192,7 +174,7 @@ class Beginning:
             )
         self.frames.append((key, frame))
         if frame.ndim == 2 or self._view.plan.pixel_format.packs(frame):
-            every = denoise.odd_stride(math.prod(_size(frame)))
+            every = denoise.odd_stride(math.prod(size_of(frame)))
             few = phase.thinned(frame, self._view.plan.pixel_format, every)
             self._few.append((key, np.ascontiguousarray(few)))
         while self._done < len(self._family) - 1 and len(self.frames) < len(self._view.plan.keys):
@@ -205,7 +187,7 @@ class Beginning:
                     self._family = []
                     return
                 self._way, self._levels = first
-                self._out = _room(*_size(got[0]))
+                self._out = room(*size_of(got[0]))
             self._way = replace(self._way, frames=got)
             on_cpu(self._way, self._out, self._done, self._done + 1)
             self._done += 1
@@ -225,16 +207,7 @@ class Beginning:
         like = way.frames[0]
         if not frames or any(f.shape != like.shape or f.dtype != like.dtype for f in frames):
             return
-        if self._summed is None:
-            kind, size = running.kind_of(steps, bool(way.sets.plain[-1]), way.sets.top)
-            H, W = _size(like)
-            rest = memory.empty((H, W * max(0, size - running.POINT_BYTES)), np.uint8)
-            self._summed = Summed(float(way.sets.pivot), kind, rest)
-        begin = int(way.sets.start[-2]) + done
-        held, addresses, row_bytes = _places(frames, int(way.sets.start[-1]), begin)
-        running.add(begin, begin + len(frames), done == 0, addresses, row_bytes, *_type(held[0]), way.sets,
-                    self._summed.kind, self._out[5], self._summed.rest, self._out[4])  # fmt: skip
-        self._summed.frames += len(frames)
+        self._summed = cores.add(way, self._out, frames, self._summed)
 
     @property
     def begun(self) -> Begun | None:
@@ -243,12 +216,6 @@ class Beginning:
         if way is None:
             return None
         return Begun(self._done, way.noise, self._levels, self._out, self._few, self._summed)
-
-
-def _room(H: int, W: int) -> tuple[AnyArray, ...]:
-    """The outputs of the kernel: phase, sigma, A, B, reasons, points, their sigma."""
-    absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
-    return absolute, sigma, A, B, memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32), sigma_mm
 
 
 FIRST_SAMPLES = 50_000  #: pixels that tell the noise of the coarsest set alone
@@ -270,7 +237,7 @@ def _first_way(
     and high backgrounds.
     """
     plan, camera = view.plan, rig.camera(view.plan.camera)
-    H, W = _size(frames[0])
+    H, W = size_of(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
         return None
     g = family[-1][1]
@@ -306,7 +273,7 @@ def way_of(
     frames = _in_order(view, family) if family else None
     if frames is None or family is None:
         return None
-    H, W = _size(frames[0])
+    H, W = size_of(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
         return None  # the stages say what is wrong
     numbers, g = [n for n, _ in family], family[-1][1]
@@ -382,7 +349,7 @@ def _in_order(view: ViewInput, family: Family, sets: int | None = None) -> tuple
         if key in there or (frame.ndim != 2 and not view.plan.pixel_format.packs(frame)):
             return None
         there[key] = frame
-    keys = [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(view.plan, n).steps)]
+    keys = _keys(view.plan, family)
     if sets is None and set(keys) != set(there):
         return None
     wanted = keys if sets is None else keys[: sum(_fringes(view.plan, n).steps for n, _ in family[:sets])]
@@ -395,9 +362,9 @@ def _in_order(view: ViewInput, family: Family, sets: int | None = None) -> tuple
     return frames if min(like.shape) >= 1 else None
 
 
-def _size(frame: AnyArray) -> tuple[int, int]:
-    """Rows and columns of pixels of a frame, which may be packed."""
-    return frame.shape[0], frame.shape[1] if frame.ndim == 2 else 2 * frame.shape[1]
+def _keys(plan: ViewPlan, family: Family) -> list[FrameKey]:
+    """Frames in the order of the sets, coarse to fine, step by step."""
+    return [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(plan, n).steps)]
 
 
 def _table(rig: Rig, camera: Camera, g: tuple[float, float], margin: float) -> geometry.DepthTable | None:
@@ -439,41 +406,3 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
         np.concatenate(geometry.lit_field(rig, camera, s.denoise.rim)).astype(f4),
         np.concatenate([a.ravel() for a in geometry.measuring_box(rig, camera, s.denoise.volume_margin)]).astype(f4),
     )
-
-
-NO_REST = np.zeros((0, 0), np.uint8)
-
-
-def on_cpu(
-    way: Way, out: tuple[AnyArray, ...], begin: int = 0, end: int | None = None, summed: Summed | None = None
-) -> None:
-    """Runs the kernel over rows on all cores, on sets `begin` .. `end` - 1; it reads the frames where they lie, packed
-    ones too. Frames of later sets may be missing. `summed`: what was begun of the last set, if all others are done.
-    """
-    held, addresses, row_bytes = _places(way.frames, int(way.sets.start[-1]))
-    last = len(way.sets.frequency) if end is None else end
-    count, kind, rest = 0, running.FLOATS, NO_REST
-    if summed is not None and begin == last - 1 > 0 and summed.pivot == way.sets.pivot:
-        count, kind, rest = summed.frames, summed.kind, summed.rest
-    k.decode(begin, last, addresses, row_bytes, *_type(held[0]), way.sets, way.limits, way.bounds, way.usual,
-             way.depths, count, kind, rest, *out)  # fmt: skip
-
-
-def _places(
-    frames: Sequence[AnyArray], count: int, begin: int = 0
-) -> tuple[list[AnyArray], NDArray[np.int64], NDArray[np.int64]]:
-    """Frames whose samples follow each other within a row; of `count` frames, whose first `begin` ones and last ones
-    may be missing, where they lie and how far apart their rows are. Who uses the addresses holds the frames.
-    """
-    held = [f if f[0].flags.c_contiguous else np.ascontiguousarray(f) for f in frames]
-    addresses, row_bytes = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    there = slice(begin, begin + len(held))
-    addresses[there] = [f.ctypes.data for f in held]
-    row_bytes[there] = [f.strides[0] for f in held]
-    return held, addresses, row_bytes
-
-
-def _type(frame: AnyArray) -> tuple[AnyArray, bool]:
-    """An array of the samples' type, and whether they are packed."""
-    packed = frame.ndim == 3
-    return np.empty(0, np.uint16 if packed else frame.dtype), packed

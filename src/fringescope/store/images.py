@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import math
 import re
 import stat
 import struct
@@ -181,6 +182,31 @@ class Images:
         """
         path = self.folder / name
         return check_frame(self.raw(name), pixel_format, size, str(path))
+
+    def plain(self, name: str) -> np.memmap[Any, Any] | None:
+        """The samples (H, W) of a frame as they lie in its file, mapped, in its order of bytes; None where they lie
+        there in any other way.
+        """
+        import tifffile
+
+        file, page = split_page(name)
+        path = self.folder / file
+        _regular(path)
+        try:
+            with path.open("rb") as f:
+                if f.read(4) not in _TIFF:
+                    return None
+            with _strict(), tifffile.TiffFile(path) as tif:
+                one = tif.pages[page or 0]
+                if not isinstance(one, tifffile.TiffPage) or not one.is_memmappable or one.samplesperpixel != 1:
+                    return None
+                dtype = np.dtype(one.dtype).newbyteorder(tif.byteorder)
+                shape, offset = (one.imagelength, one.imagewidth), one.dataoffsets[0]
+            if dtype.kind != "u" or offset + math.prod(shape) * dtype.itemsize > path.stat().st_size:
+                return None
+            return np.memmap(path, dtype, "r", offset, shape)
+        except Exception:  # whoever reads it whole says what is wrong with it
+            return None
 
     def _page(self, file: str, page: int | None, data: bytes | None = None) -> tifffile.TiffPage:
         import tifffile
