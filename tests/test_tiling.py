@@ -20,6 +20,12 @@ from tests.test_fused import packed, rig_of, view_of
 S = Settings()
 
 
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch):
+    """Whose arrays are no larger than said."""
+    monkeypatch.setattr(arrival, "SLACK", 0)
+
+
 class OnDisk:
     """Frames of which rows can be had; counts how many rows of all of them were asked for at a time."""
 
@@ -104,12 +110,12 @@ def test_frames_that_fit_are_taken_as_ever():
 
 
 def test_a_scan_by_rows_is_the_scan_at_once():
-    rig = rig_of(300, 131)
+    rig = rig_of(300, 83)
     views = [view_of(rig, c, PixelFormat.MONO16, steps=(8, 8, 8), seed=i) for i, c in enumerate(rig.cameras)]
     shown = []
     want = pipeline.scan(views, rig, S, first=shown.append)
     disks = [OnDisk(v.frames) for v in views]
-    n = 300 * 131
+    n = 300 * 83
     budget = n * (arrival.VIEW_BYTES + 3 * (arrival.KEPT_BYTES + arrival.CLOUD_BYTES)) + 40 * 300 * 24 * 2
     budget += arrival.SLACK
     tiled = [replace(v, frames=d) for v, d in zip(views, disks, strict=True)]
@@ -121,14 +127,14 @@ def test_a_scan_by_rows_is_the_scan_at_once():
 
 
 def test_what_does_not_fit_by_rows_is_refused_with_the_figure():
-    rig = rig_of(620, 480)
+    rig = rig_of(620, 131)
     view = view_of(rig, rig.cameras[1], PixelFormat.MONO8)
     disk = OnDisk(view.frames)
-    with pytest.raises(ResourceError, match=r"1 view, 0.3 megapixels in all, need about 0.0 GB of memory, a few"):
-        pipeline.scan_view(replace(view, frames=disk), rig, S, budget=620 * 480 * arrival.VIEW_BYTES)
+    with pytest.raises(ResourceError, match=r"1 view, 0.1 megapixels in all, need about 0.0 GB of memory, a few"):
+        pipeline.scan_view(replace(view, frames=disk), rig, S, budget=620 * 131 * arrival.VIEW_BYTES)
     assert (disk.whole, disk.asked) == (0, [])
-    with pytest.raises(ResourceError, match=r"1 view, 0.3 megapixels in all, need about 0.0 GB of memory; 0.0 GB are"):
-        pipeline.scan_view(replace(view, frames=iter(view.frames)), rig, S, budget=budget_for(view, rig, 100))
+    with pytest.raises(ResourceError, match=r"1 view, 0.1 megapixels in all, need about 0.0 GB of memory; 0.0 GB are"):
+        pipeline.scan_view(replace(view, frames=iter(view.frames)), rig, S, budget=budget_for(view, rig, 50))
     huge = replace(view, frames=OnDisk([]))
     big = rig_of(62_000, 48_000)
     with pytest.raises(ResourceError, match=r"2976.0 megapixels in all, need about 1\d\d.\d GB of memory, a few"):
@@ -291,7 +297,9 @@ def scan(folder, budget):
     return int(grid.valid.sum())
 
 scan(sys.argv[1], None)  # imports and kernels
+pipeline.arrival.SLACK, slack = 0, pipeline.arrival.SLACK
 scan(sys.argv[1], int(sys.argv[3]))
+pipeline.arrival.SLACK = slack
 memory.release()
 before = told("VmRSS")
 Path("/proc/self/clear_refs").write_text("5")
@@ -327,7 +335,7 @@ def test_a_capture_of_twice_the_budget_stays_within_it(tmp_path):
 
 
 def test_bands_are_as_high_as_memory_allows_and_sixteen_rows_at_least():
-    rig = rig_of(620, 480)
+    rig = rig_of(620, 131)
     view = view_of(rig, rig.cameras[1], PixelFormat.MONO8)
     (one,) = arrival.fitted([replace(view, frames=OnDisk([]))], rig, budget_for(view, rig, 100), alone=True)
     assert isinstance(one.frames, tiling.ByRows)

@@ -205,11 +205,12 @@ def fitted(
     least += sum(sorted(0 if t else size for t, size in zip(tiled, frames, strict=True))[-AHEAD:])
     one = max(n * ONE_FRAME * v.plan.pixel_format.dtype.itemsize for n, v in zip(pixels, views, strict=True))
     row = [lens.width * _bytes_of(v) for lens, v in zip(lenses, views, strict=True)]
+    how = ""
     if any(tiled):
         least += SLACK
-        need = least + max(one, tiling.LEAST * max(r for t, r in zip(tiled, row, strict=True) if t))
+        by_rows = least + max(one, tiling.LEAST * max(r for t, r in zip(tiled, row, strict=True) if t))
+        how, need = (", a few rows of their frames at a time", by_rows) if by_rows < need else ("", need)
     if need > free:
-        how = ", a few rows of their frames at a time" if any(tiled) else ""
         count = "1 view" if len(views) == 1 else f"{len(views)} views"
         raise ResourceError(
             f"{count}, {sum(pixels) / 1e6:.1f} megapixels in all, need about {need / 1e9:.1f} GB of memory{how}; "

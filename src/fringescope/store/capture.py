@@ -11,7 +11,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from fringescope.errors import CaptureError, RigError
@@ -172,18 +171,18 @@ class RowedFrames(Frames):
     def rows(self, first: int, last: int) -> Iterator[tuple[FrameKey, AnyArray]]:
         """Rows first to last - 1 of each frame. Raises as reading a frame does, and OutputError as `Spool`."""
         view, images = self._view, Images(self._capture.folder)
-        mapped = {key: images.plain(name) for key, name in zip(view.plan.keys, view.files, strict=True)}
+        plain = [images.plain(name) for name in view.files]
+        frames = list(zip(view.plan.keys, view.files, plain, strict=True))
         if self._spool is None:
-            others = [(key, name) for (key, m), name in zip(mapped.items(), view.files, strict=True) if m is None]
-            self._spool = Spool((key, self._read(name, images)) for key, name in others)
+            self._spool = Spool((key, self._read(name, images)) for key, name, lies in frames if lies is None)
         spooled = self._spool.rows(first, last)
-        for (key, samples), name in zip(mapped.items(), view.files, strict=True):
-            if samples is None:
+        for key, name, lies in frames:
+            if lies is None:
                 yield next(spooled)
-            else:
-                some: AnyArray = np.array(samples[first:last], samples.dtype.newbyteorder("="))
-                size = view.size if len(some) == view.size[1] else None
-                yield key, check_frame(some, view.plan.pixel_format, size, str(images.folder / name))
+                continue
+            some = lies.rows(first, last)
+            size = view.size if len(some) == lies.height else None
+            yield key, check_frame(some, view.plan.pixel_format, size, str(images.folder / name))
 
 
 # ------------------------------------------------------------------------------------------------------------ reading
