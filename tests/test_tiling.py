@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fringescope import memory, pipeline, store
+from fringescope.cli import run
 from fringescope.errors import CaptureError, ResourceError
 from fringescope.pipeline import arrival, fast, tiling
 from fringescope.settings import Settings
@@ -256,6 +257,25 @@ def test_a_damaged_file_is_said_by_rows_too(tmp_path):
         pipeline.scan_view(stored, rig, S, budget=budget_for(view, rig, 20))
 
 
+def test_reconstruct_takes_rows_where_memory_is_short(tmp_path, monkeypatch):
+    """The verb, end to end: the same cloud, to the byte, with frames that would not fit."""
+    rig = rig_of(300, 83)
+    view = view_of(rig, rig.cameras[1], PixelFormat.MONO16, steps=(8, 8, 8))
+    captured(tmp_path / "capture", view)
+    store.write_rig(tmp_path / "rig.json", rig)
+    n, taken, clouds = 300 * 83, [], []
+    budget = n * (arrival.VIEW_BYTES + arrival.KEPT_BYTES + arrival.CLOUD_BYTES) + 20 * 300 * 24 * 2
+    in_bands = tiling.ByRows.in_bands
+    monkeypatch.setattr(tiling.ByRows, "in_bands", lambda self, *a: (taken.append(self.rows), in_bands(self, *a))[1])
+    for name, free in (("whole", None), ("rows", budget)):
+        monkeypatch.setattr(memory, "available", lambda free=free: free)
+        out, how = tmp_path / name, ["--rig", str(tmp_path / "rig.json"), "--out"]
+        assert run(["reconstruct", str(tmp_path / "capture"), *how, str(out)]) == 0
+        clouds.append((out / "cloud.ply").read_bytes())
+    assert taken == [20]
+    assert clouds[0] == clouds[1]
+
+
 def many(rig):
     """A view of which the frames are most: 72 of 16 bits."""
     return view_of(rig, rig.cameras[1], PixelFormat.MONO16, steps=(24, 24, 24))
@@ -285,6 +305,7 @@ PEAK = """
 import sys
 from pathlib import Path
 from fringescope import memory, pipeline, store
+from fringescope.cli import run
 from fringescope.settings import Settings
 
 def told(what):
