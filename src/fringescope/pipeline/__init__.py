@@ -88,13 +88,10 @@ def scan_view(
 def scan_gathered(
     view: ViewInput, begun: fast.Begun | None, rig: Rig, s: Settings, device: Device
 ) -> tuple[Decoded, Grid]:
-    """As `scan_view`, of a view as `arrival.gathered` gives it; frames that were gathered for it are let go of."""
+    """As `scan_view`, of a view as `arrival.gathered` gives it; frames that were gathered are let go of once decoded."""
     fused = fast.decode(view, rig, s, device, begun)  # the same in one pass, for the usual plans
     if fused is not None:
         decoded, xyz, sigma, steps = fused
-        if begun is not None and isinstance(view.frames, list):
-            view.frames.clear()  # they were gathered for this view alone: their memory serves the masks
-            begun.few.clear()
         tiles = denoise.Tiles(decoded, (steps,))
         reasons = _masked(decoded, decoded.reasons, rig, s, tiles)
         grid = triangulate.blanked(xyz, sigma, reasons, rig, decoded.camera)

@@ -56,7 +56,15 @@ class Begun(NamedTuple):
     levels: F32  #: backgrounds, codes, at which that counts
     out: tuple[AnyArray, ...]  #: the outputs of the kernel, which hold it
     few: list[tuple[FrameKey, AnyArray]]  #: every n-th pixel of the frames, for statistics
-    summed: Summed | None  #: of the finest set; used up by `decode`
+    frames: list[tuple[FrameKey, AnyArray]]  #: that were gathered for this view alone
+    summed: Summed | None  #: of the finest set
+
+    def let_go(self) -> None:
+        """Frames and sums have been used: their memory serves votes and masks."""
+        self.few.clear()
+        self.frames.clear()
+        if self.summed is not None:
+            self.summed.frames, self.summed.rest = 0, cores.NO_REST
 
 
 class Fused(NamedTuple):
@@ -75,8 +83,8 @@ def decode(
     in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
     `view.frames` must be a sequence, or `ByRows` on the processor, unless `takes` refuses the view. What was `begun` is
-    gone on from, if it rests on what all frames say. Points have yet to be blanked where `reasons` says so. Raises as
-    the stages do.
+    gone on from, if it rests on what all frames say; the frames that were gathered for it are let go of. Points have yet
+    to be blanked where `reasons` says so. Raises as the stages do.
     """
     tiled = view.frames if isinstance(view.frames, ByRows) else None
     few = begun.few if begun is not None else None
@@ -101,8 +109,9 @@ def decode(
     else:
         good = begun if begun is not None and _still_holds(begun, way, s) else None
         on_cpu(way, out, good.sets if good is not None else 0, summed=good.summed if good is not None else None)
-    if begun is not None and begun.summed is not None:
-        begun.summed.frames, begun.summed.rest = 0, cores.NO_REST  # its memory serves the masks
+    if begun is not None:
+        way = replace(way, frames=())
+        begun.let_go()
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -215,7 +224,7 @@ class Beginning:
         way = self._way
         if way is None:
             return None
-        return Begun(self._done, way.noise, self._levels, self._out, self._few, self._summed)
+        return Begun(self._done, way.noise, self._levels, self._out, self._few, self.frames, self._summed)
 
 
 FIRST_SAMPLES = 50_000  #: pixels that tell the noise of the coarsest set alone
