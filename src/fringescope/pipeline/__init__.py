@@ -88,7 +88,7 @@ def scan_view(
 def scan_gathered(
     view: ViewInput, begun: fast.Begun | None, rig: Rig, s: Settings, device: Device
 ) -> tuple[Decoded, Grid]:
-    """As `scan_view`, of a view as `arrival.gathered` gives it; frames that were gathered are let go of once decoded."""
+    """As `scan_view`, of a view as `arrival.gathered` gives it; frames that were gathered are gone once decoded."""
     fused = fast.decode(view, rig, s, device, begun)  # the same in one pass, for the usual plans
     if fused is not None:
         decoded, xyz, sigma, steps = fused

@@ -83,8 +83,8 @@ def decode(
     in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
     `view.frames` must be a sequence, or `ByRows` on the processor, unless `takes` refuses the view. What was `begun` is
-    gone on from, if it rests on what all frames say; the frames that were gathered for it are let go of. Points have yet
-    to be blanked where `reasons` says so. Raises as the stages do.
+    gone on from, if it rests on what all frames say; the frames that were gathered for it are let go of. Points have
+    yet to be blanked where `reasons` says so. Raises as the stages do.
     """
     tiled = view.frames if isinstance(view.frames, ByRows) else None
     few = begun.few if begun is not None else None
@@ -104,6 +104,7 @@ def decode(
             return None
         frames = [phase.unpacked(f, view.plan.pixel_format) for f in way.frames]
         gpu.by_slabs(frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
+        del frames
     elif tiled is not None:
         by_rows(tiled, way, _keys(view.plan, _parallel(view.plan) or []), out)
     else:
