@@ -310,7 +310,7 @@ def test_frames_yet_to_come_count_by_their_format(monkeypatch):
         for free in range(0, 6_000_000, 1000):
             monkeypatch.setattr(arrival.memory, "available", lambda free=free: free)
             try:
-                arrival.check_memory(some, rig)
+                arrival.fitted(some, rig)
             except ResourceError:
                 continue
             room[name] = free

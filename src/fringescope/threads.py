@@ -48,29 +48,47 @@ def _share(work: Callable[..., None], bands: list[tuple[int, int]], args: tuple[
         h.result()
 
 
-def by_rows(count: Callable[..., int | tuple[int, int]]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+class OverRows:
+    """A kernel that `by_rows` has decorated."""
+
+    def __init__(self, compiled: Any, count: Callable[..., int | tuple[int, int]]) -> None:
+        self.rows = compiled  #: the compiled kernel itself
+        self._count = count
+
+    def __call__(self, *args: Any) -> None:
+        """Work on all rows, on all cores."""
+        n, size = self._counted(args)
+        self._run(0, n, size, args)
+
+    def among(self, begin: int, end: int, *args: Any) -> None:
+        """Work on some of the rows alone."""
+        n, size = self._counted(args)
+        self._run(begin, end, size * (end - begin) // max(n, 1), args)
+
+    def _counted(self, args: tuple[Any, ...]) -> tuple[int, int]:
+        told = self._count(*args)
+        return told if isinstance(told, tuple) else (told, max(getattr(a, "size", 0) for a in args))
+
+    def _run(self, begin: int, end: int, size: int, args: tuple[Any, ...]) -> None:
+        n = end - begin
+        if n < SMALL or WORKERS == 1 or size < LITTLE:
+            self.rows(begin, end, *args)
+            return
+        blocks = max(min(BLOCKS, n, size // BLOCK), WORKERS)
+        _share(self.rows, [(begin + n * b // blocks, begin + n * (b + 1) // blocks) for b in range(blocks)], args)
+
+
+def by_rows(count: Callable[..., int | tuple[int, int]]) -> Callable[[Callable[..., None]], OverRows]:
     """Decorate a kernel `f(first, last, *args)` that works on rows first..last-1 and writes nothing outside them.
 
     The decorated kernel is called as `f(*args)`; `count(*args)` tells the number of rows, and how many elements it
     works on where those are not all of its largest array. It is compiled by Numba without the interpreter's lock.
-    `f.rows` is the compiled kernel itself.
     """
 
-    def decorate(f: Callable[..., None]) -> Callable[..., None]:
-        compiled: Any = njit(cache=True, nogil=True, error_model="numpy")(f)
-
-        @functools.wraps(f)
-        def call(*args: Any) -> None:
-            told = count(*args)
-            n, size = told if isinstance(told, tuple) else (told, max(getattr(a, "size", 0) for a in args))
-            if n < SMALL or WORKERS == 1 or size < LITTLE:
-                compiled(0, n, *args)
-                return
-            blocks = max(min(BLOCKS, n, size // BLOCK), WORKERS)
-            _share(compiled, [(n * b // blocks, n * (b + 1) // blocks) for b in range(blocks)], args)
-
-        call.rows = compiled  # type: ignore[attr-defined]
-        return call
+    def decorate(f: Callable[..., None]) -> OverRows:
+        kernel = OverRows(njit(cache=True, nogil=True, error_model="numpy")(f), count)
+        functools.update_wrapper(kernel, f)
+        return kernel
 
     return decorate
 

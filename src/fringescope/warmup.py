@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from fringescope import denoise, geometry, patterns, pipeline, report
-from fringescope.pipeline import guidance
+from fringescope.pipeline import fast, guidance
 from fringescope.settings import MeshSettings, Settings
 from fringescope.twin import presets
 from fringescope.types import (
@@ -80,6 +80,7 @@ def compile_kernels(every_plan: bool = False) -> int:
     views = _views(rig, PixelFormat.BAYER_RG8)
     s = Settings(mesh=MeshSettings(triangles=2000, preview_triangles=300, preview_pixels=20_000))  # simplified, thinned
     scan = pipeline.scan(views, rig, s, all_points=True, first=lambda _surface: None)
+    _as_they_come(views[0], rig, s)
     nearer = replace(scan.grids[0], xyz=scan.grids[0].xyz + np.array([0, 0, 3], np.float32))
     denoise.agree((nearer, *scan.grids[1:]), rig, s.denoise)  # views that disagree
     if scan.surface is not None:
@@ -93,11 +94,21 @@ def compile_kernels(every_plan: bool = False) -> int:
     return len(scan.cloud)
 
 
+def _as_they_come(view: ViewInput, rig: Rig, s: Settings) -> None:
+    """Frames that are summed one by one."""
+    beginning = fast.Beginning(view, rig, s)
+    for key, frame in view.frames:
+        beginning.add(key, frame)
+    fast.decode(replace(view, frames=beginning.frames), rig, s, "cpu", beginning.begun)
+
+
 def _other_plans(rig: Rig, usual: ViewInput, s: Settings) -> None:
     """One view of each other kind: more bits, other colours, no picture, and what only the stages take."""
     for fmt in (PixelFormat.BAYER_RG12, PixelFormat.MONO16, PixelFormat.MONO8, PixelFormat.RGB8):
         view = _views(rig, fmt)[0]
         pipeline.scan([view], rig, s, surface=False)
+        if fast.takes(view):
+            _as_they_come(view, rig, s)
         pipeline.decode_view(view, s)
     pipeline.scan([replace(usual, color=None)], rig, s, surface=False)
     pipeline.decode_view(usual, s)

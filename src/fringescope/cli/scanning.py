@@ -67,7 +67,7 @@ def scan_into(
     c = picked(store.read_capture(capture), only)
     with ThreadPoolExecutor(1) as aside:
         reading = aside.submit(store.read_rig, rig)
-        views = store.view_inputs(c, load_response(response), ahead=True)
+        views = store.view_inputs(c, load_response(response), ahead=True, rowed=True)
         from fringescope import export, pipeline  # while rig and frames are read: this takes longest
 
         r = reading.result()

@@ -60,6 +60,15 @@ def sums(x, first, last, cos, sin, pivot, n, acc):
         acc[_P + j] = _ZERO
         acc[_Q + j] = _ZERO
         acc[_S + j] = _ZERO
+    more(x, first, last, cos, sin, pivot, n, acc)
+    rest_of(acc, last - first, n)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def more(x, first, last, cos, sin, pivot, n, acc):
+    """Add frames first..last-1 to sums of I, I cos, I sin, I I, one after the other: so it does not matter, not even
+    to the last bit, how many are added at a time.
+    """
     f = first
     while f + 4 <= last:
         xa, xb, xc, xd = x[f], x[f + 1], x[f + 2], x[f + 3]
@@ -67,10 +76,10 @@ def sums(x, first, last, cos, sin, pivot, n, acc):
         sa, sb, sc, sd = sin[f], sin[f + 1], sin[f + 2], sin[f + 3]
         for j in range(n):
             a, b, c, d = _f(xa[j]) - pivot, _f(xb[j]) - pivot, _f(xc[j]) - pivot, _f(xd[j]) - pivot
-            acc[j] += (a + b) + (c + d)
-            acc[_P + j] += (a * ca + b * cb) + (c * cc + d * cd)
-            acc[_Q + j] += (a * sa + b * sb) + (c * sc + d * sd)
-            acc[_S + j] += (a * a + b * b) + (c * c + d * d)
+            acc[j] = (((acc[j] + a) + b) + c) + d
+            acc[_P + j] = (((acc[_P + j] + a * ca) + b * cb) + c * cc) + d * cd
+            acc[_Q + j] = (((acc[_Q + j] + a * sa) + b * sb) + c * sc) + d * sd
+            acc[_S + j] = (((acc[_S + j] + a * a) + b * b) + c * c) + d * d
         f += 4
     while f < last:
         xa = x[f]
@@ -82,7 +91,12 @@ def sums(x, first, last, cos, sin, pivot, n, acc):
             acc[_Q + j] += a * sa
             acc[_S + j] += a * a
         f += 1
-    mean, gain = _ONE / _f(last - first), _TWO / _f(last - first)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_CONTRACT)
+def rest_of(acc, steps, n):
+    """Sums of I, I cos, I sin, I I of a whole set: squared residuals in place of the last."""
+    mean, gain = _ONE / _f(steps), _TWO / _f(steps)
     for j in range(n):
         t, p, q = acc[j], acc[_P + j], acc[_Q + j]
         acc[_S + j] = left_over(acc[_S + j], t, p, q, t * mean, p * gain, q * gain, _ONE)

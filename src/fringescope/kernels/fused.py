@@ -37,6 +37,7 @@ from fringescope.kernels.depths import mark_outside, points, row_cubics, unowned
 from fringescope.kernels.fringes import best_order, clipped_gain, clipped_sinusoid, count_clipped
 from fringescope.kernels.pixel import TWO_PI
 from fringescope.kernels.raw import samples_at, unowned
+from fringescope.kernels.running import FLOATS, POINT_BYTES, finish
 from fringescope.kernels.sinusoid import ROUNDING
 from fringescope.threads import by_rows
 
@@ -197,13 +198,9 @@ def clipped_pixel(x, j, sets, limits, bounds, phase, sigma, background, modulati
     return reasons, best / turn, own / turn, a, b
 
 
-@by_rows(
-    lambda _begin, _end, _addresses, _bytes, _like, _packed, _sets, _limits, _bounds, _usual, _depths, phase, *_: (
-        phase.shape[0]
-    )
-)
+@by_rows(lambda *args: args[-1].shape[0])
 def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths,
-           phase, sigma, background, modulation, reasons, xyz, sigma_mm):  # fmt: skip
+           summed, kind, rest, phase, sigma, background, modulation, reasons, xyz, sigma_mm):  # fmt: skip
     """Raw frames to points: the rows of frame f lie `row_bytes[f]` apart in memory, from `addresses[f]` on, as samples
     of the type of the array `like`; or `packed`, two samples of 12 bits in three octets.
 
@@ -215,21 +212,24 @@ def decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, li
     far say, for the next call to go on from: absolute phase, its variance, turns; squared margin, B, misfit; and at the
     head of each block whether all sets have to be taken at once: for orders that only they tell apart, and saturated
     samples. Frames of sets that are yet to come are not read.
+
+    So many frames of the finest set are `summed` already, if all others are done: the sums, of `kind`, lie in `xyz` and
+    `rest`, see `running.add`. Not all of them; 0: none.
     """
     F, K = len(addresses), len(sets.frequency)
     samples, top, bits = np.empty((F, BLOCK), like.dtype), np.empty(BLOCK, like.dtype), np.empty(BLOCK, np.uint16)
     floats = np.empty((SCRATCH + 3 * K) * BLOCK, np.float32)
     out = phase, sigma, background, modulation, reasons, xyz, sigma_mm
-    _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, out,
-            samples, top, bits, floats)  # fmt: skip
+    _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, summed,
+            kind, rest, out, samples, top, bits, floats)  # fmt: skip
 
 
 SCRATCH = 29  #: lines of BLOCK floats that `_decode` needs, and three for each set
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, out,
-            samples, top, bits, floats):  # fmt: skip
+def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, limits, bounds, usual, depths, summed,
+            kind, rest, out, samples, top, bits, floats):  # fmt: skip
     """See `decode`. The caller holds the arrays."""
     phase, sigma, background, modulation, reasons, xyz, sigma_mm = out
     F, K = len(addresses), len(sets.frequency)
@@ -237,6 +237,7 @@ def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, l
     phase, sigma, background, modulation = unowned(phase), unowned(sigma), unowned(background), unowned(modulation)
     reasons, sigma_mm = unowned(reasons), unowned(sigma_mm)
     xyz = samples_at(xyz.ctypes.data, (height, 3 * W), xyz)
+    beyond = rest.shape[1] // max(W, 1)
     addresses, row_bytes, like, octet = unowned(addresses), unowned(row_bytes), unowned(like), unowned(NO_OCTET)
     sets, limits, depths = unowned_sets(sets), unowned_limits(limits), unowned_depths(depths)
     x, top, bits = unowned(samples), unowned(top), unowned(bits)
@@ -250,6 +251,7 @@ def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, l
     margins, found = (
         samples_at(room + 8 * line, (2, BLOCK), floats), samples_at(room + 10 * line, (2, 4, BLOCK), floats)
     )  # fmt: skip
+    summands = samples_at(room + 10 * line, (8, BLOCK), floats)  # where `found` lies, which comes later
     lines = samples_at(room + 18 * line, (11, BLOCK), floats)
     absolute, chi2, best, rough, back, around, fine, other = (
         lines[0], lines[1], lines[2], lines[3], lines[4], lines[5], lines[6], lines[7]
@@ -279,11 +281,12 @@ def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, l
             a = begin if begin > 0 and out_r[0] == 0 else 0
             if a == 0 and begin > 0 and end < K:
                 continue  # once all sets have come
-            f, g = sets.start[a], sets.start[end]
+            ready = summed if a > 0 else 0
+            f, g = sets.start[a] + ready, sets.start[end]
             brightest = load(x, f, g, addresses, row_bytes, i, col, n, like, packed, octet, top)
             if a > 0 and brightest >= sets.top and end == K:
                 brightest = load(x, 0, F, addresses, row_bytes, i, col, n, like, packed, octet, top)
-                a = 0
+                a = ready = 0
             for j in range(n):
                 rough[j] = _ZERO
             turn = 0  #: which of `margins` and `found` holds
@@ -301,7 +304,12 @@ def _decode(first, last, begin, end, addresses, row_bytes, like, packed, sets, l
                 k = end - 1 - back_to_front
                 f, g = sets.start[k], sets.start[k + 1]
                 pivot = sets.pivot
-                if g - f == 4 and sets.plain[k]:
+                if ready > 0:
+                    here = xyz.ctypes.data + (i * W + col) * POINT_BYTES
+                    there = rest.ctypes.data + (i * W + col) * beyond
+                    pivot = pivot if kind == FLOATS else _ZERO
+                    finish(kind, x, f + ready, g, f, sets, pivot, n, here, there, summands, acc)
+                elif g - f == 4 and sets.plain[k]:
                     four(x, f, n, acc)
                     pivot = _ZERO
                 elif g - f == 8 and sets.plain[k]:

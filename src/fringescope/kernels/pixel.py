@@ -21,23 +21,39 @@ _PER_TURN2 = np.float32(1.0 / (4.0 * math.pi**2))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
+def four_of_harmonics(total, in_phase, quadrature, off):
+    """Sums of I, I cos, I sin and squared residuals of four samples a, b, c, d, from their sum, a - c, b - d, and
+    a - b + c - d.
+    """
+    return total, in_phase, quadrature, _f(0.25) * off * off
+
+
+@njit(cache=True, inline="always", error_model="numpy")
 def of_four(a, b, c, d):
     """Sums of I, I cos, I sin and squared residuals of four samples, by differences."""
     even, odd = a + c, b + d
-    off = even - odd
-    return even + odd, a - c, b - d, _f(0.25) * off * off
+    return four_of_harmonics(even + odd, a - c, b - d, even - odd)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def eight_of_harmonics(total, c4, c2, q2, d0, d2, less, both):
+    """As `four_of_harmonics`, of eight samples: the residuals are their second, third and fourth harmonics.
+
+    With the differences d0 .. d3 of opposite samples: `less` is d1 - d3, `both` d1 + d3.
+    """
+    u, v = _HALF_ROOT * less, _HALF_ROOT * both
+    c3, q3 = d0 - u, v - d2
+    rest = _f(0.25) * ((c2 * c2 + q2 * q2) + (c3 * c3 + q3 * q3)) + _f(0.125) * c4 * c4
+    return total, d0 + u, d2 + v, rest
 
 
 @njit(cache=True, inline="always", error_model="numpy")
 def of_eight(a, b, c, d, e, f, g, h):
-    """As `of_four`, of eight samples: the residuals are their second, third and fourth harmonics."""
+    """As `of_four`, of eight samples."""
     s0, s1, s2, s3 = a + e, b + f, c + g, d + h
     d0, d1, d2, d3 = a - e, b - f, c - g, d - h
     even, odd = s0 + s2, s1 + s3
-    u, v = _HALF_ROOT * (d1 - d3), _HALF_ROOT * (d1 + d3)
-    c2, q2, c3, q3, c4 = s0 - s2, s1 - s3, d0 - u, v - d2, even - odd
-    rest = _f(0.25) * ((c2 * c2 + q2 * q2) + (c3 * c3 + q3 * q3)) + _f(0.125) * c4 * c4
-    return even + odd, d0 + u, d2 + v, rest
+    return eight_of_harmonics(even + odd, even - odd, s0 - s2, s1 - s3, d0, d2, d1 - d3, d1 + d3)
 
 
 @njit(cache=True, inline="always", error_model="numpy")

@@ -66,23 +66,29 @@ def measured_view(view: ViewInput, s: Settings) -> Decoded:
     return response.corrected(phase.measure(view.frames, view.plan, s.phase, view.noise), view.response)
 
 
-def scan_view(view: ViewInput, rig: Rig, s: Settings, *, device: Device = "cpu") -> tuple[Decoded, Grid]:
+def scan_view(
+    view: ViewInput, rig: Rig, s: Settings, *, device: Device = "cpu", budget: int | None = None
+) -> tuple[Decoded, Grid]:
     """One camera's frames to organised points with sigma (Fig. 6, with the masks of Fig. 7).
 
     `device="gpu"` decodes and triangulates on an NVIDIA GPU, equal within float32's rounding; masks stay here. A plan
-    that the fused way does not take goes through the stages, here as well, and a note of the view says so.
-    Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do; UsageError where
-    there is no such device.
+    that the fused way does not take goes through the stages, here as well, and a note of the view says so. Frames that
+    can give rows (`RowFrames`) and do not fit into `budget` bytes, or what memory is left, are taken some rows at a
+    time; the results are the same.
+    Raises CaptureError, DecodeError or RigError, each with what came, what was needed and what to do; ResourceError
+    where memory does not suffice for the results; UsageError where there is no such device.
     """
     check_device(device)
     geometry.check_baseline(rig, rig.camera(view.plan.camera))
-    return _scanned(*arrival.gathered(view, rig, s), rig, s, device)  # frames may still be arriving
+    if budget is not None or isinstance(view.frames, RowFrames):
+        (view,) = arrival.fitted([view], rig, budget, alone=True, device=device)
+    return scan_gathered(*arrival.gathered(view, rig, s), rig, s, device)  # frames may still be arriving
 
 
-def _scanned(
+def scan_gathered(
     view: ViewInput, begun: fast.Begun | None, rig: Rig, s: Settings, device: Device
 ) -> tuple[Decoded, Grid]:
-    """See `scan_view`."""
+    """As `scan_view`, of a view as `arrival.gathered` gives it; frames that were gathered are gone once decoded."""
     fused = fast.decode(view, rig, s, device, begun)  # the same in one pass, for the usual plans
     if fused is not None:
         decoded, xyz, sigma, steps = fused
@@ -360,6 +366,7 @@ def scan(
     all_points: bool = False,
     surface: bool = True,
     device: Device = "cpu",
+    budget: int | None = None,
     progress: Progress | None = None,
     first: Callable[[Surface], None] | None = None,
 ) -> Scan:
@@ -367,8 +374,8 @@ def scan(
 
     `all_points` also lists every valid pixel of every view, unthinned; `surface=False` leaves out the mesh. Where the
     points are too few or too far apart for a triangle, the surface is None and `figures["surface"]` says why. `device`:
-    see `scan_view`. `first` is called with the coarse surface of `preview`, and not called where there is none: as soon
-    as all frames have come, and before the fine work on them begins.
+    and `budget`: see `scan_view`. `first` is called with the coarse surface of `preview`, and not called where there
+    is none: as soon as all frames have come, and before the fine work on them begins.
 
     Frames of a view that are neither a list nor a tuple are taken in another thread as they come, view after view in
     their order, while views that are there are worked on. Raises EmptyResultError, with the reasons, if no view keeps a
@@ -378,7 +385,7 @@ def scan(
     check_device(device)
     if not views:
         raise EmptyResultError("no view to scan; needed the frames of one camera at least")
-    arrival.check_memory(views, rig)
+    views = arrival.fitted(views, rig, budget, device=device)
     tell = progress or _silent
     times: dict[str, float] = {}
     grids: list[Grid] = []
@@ -398,7 +405,7 @@ def scan(
             come = arrival.held(come)
             _show_early(early, [come], len(views), first)
         start = perf_counter()
-        decoded, grid = _scanned(come, begun, rig, s, device)
+        decoded, grid = scan_gathered(come, begun, rig, s, device)
         return decoded, grid, picture(come, decoded, s), pictures.taken(come, decoded), perf_counter() - start
 
     with arrival.each(one, views, rig, at_once=device == "cpu" and first is None) as made:

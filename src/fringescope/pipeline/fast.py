@@ -8,20 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
+from time import perf_counter
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from fringescope import denoise, geometry, memory, phase
+from fringescope import denoise, geometry, phase
 from fringescope.errors import CaptureError, RigError
 from fringescope.kernels import fused as k
 from fringescope.kernels.depths import Depths
+from fringescope.pipeline import cores
+from fringescope.pipeline.cores import Summed, Way, by_rows, on_cpu, room, size_of
+from fringescope.pipeline.tiling import ByRows
 from fringescope.settings import Settings
 from fringescope.types import (
     F32,
-    F64,
     AnyArray,
     Camera,
     Decoded,
@@ -45,22 +48,6 @@ TWO_PI = 2 * np.pi
 f4 = np.float32
 
 
-@dataclass(frozen=True, eq=False)
-class Way:
-    """What the kernel needs to know of a view: its frames in the order of its sets, coarse to fine, and the tables."""
-
-    frames: tuple[AnyArray, ...]
-    g: tuple[float, float]
-    noise: NoiseModel
-    notes: tuple[str, ...]
-    table: geometry.DepthTable
-    sets: k.Sets
-    limits: k.Limits
-    depths: Depths
-    bounds: F64  #: (4, h, w) turns
-    usual: F64  #: (8, 8)
-
-
 class Begun(NamedTuple):
     """What the coarser sets of a view say, worked out while its finer ones were still on their way."""
 
@@ -68,6 +55,16 @@ class Begun(NamedTuple):
     noise: NoiseModel  #: that it rests on
     levels: F32  #: backgrounds, codes, at which that counts
     out: tuple[AnyArray, ...]  #: the outputs of the kernel, which hold it
+    few: list[tuple[FrameKey, AnyArray]]  #: every n-th pixel of the frames, for statistics
+    frames: list[tuple[FrameKey, AnyArray]]  #: that were gathered for this view alone
+    summed: Summed | None  #: of the finest set
+
+    def let_go(self) -> None:
+        """Frames and sums have been used: their memory serves votes and masks."""
+        self.few.clear()
+        self.frames.clear()
+        if self.summed is not None:
+            self.summed.frames, self.summed.rest = 0, cores.NO_REST
 
 
 class Fused(NamedTuple):
@@ -85,14 +82,20 @@ def decode(
     """A view's frames to absolute phase with the reasons of exposure and order, and to points and their sigma, mm, all
     in one pass; None for a view that the fused kernel, or that of the GPU, does not take.
 
-    `view.frames` must be a sequence, unless `takes` refuses the view. What was `begun` is gone on from, if it rests on
-    what all frames say. Points have yet to be blanked where `reasons` says so. Raises as the stages do.
+    `view.frames` must be a sequence, or `ByRows` on the processor, unless `takes` refuses the view. What was `begun` is
+    gone on from, if it rests on what all frames say; the frames that were gathered for it are let go of. Points have
+    yet to be blanked where `reasons` says so. Raises as the stages do.
     """
-    way = way_of(view, rig, s)
+    tiled = view.frames if isinstance(view.frames, ByRows) else None
+    few = begun.few if begun is not None else None
+    if tiled is not None:
+        hollow, few = tiled.looked_over(view.plan, rig.camera(view.plan.camera).lens.height)
+        view = replace(view, frames=hollow)
+    way = way_of(view, rig, s, few)
     if way is None:
         return None
-    H, W = _size(way.frames[0])
-    out = begun.out if begun is not None else _room(H, W)
+    H, W = size_of(way.frames[0])
+    out = begun.out if begun is not None else room(H, W)
     absolute, sigma, A, B, reasons, xyz, sigma_mm = out
     if device == "gpu":
         from fringescope.pipeline import gpu  # only then: Numba's CUDA is slow to import
@@ -101,8 +104,15 @@ def decode(
             return None
         frames = [phase.unpacked(f, view.plan.pixel_format) for f in way.frames]
         gpu.by_slabs(frames, way.sets, way.limits, way.bounds, way.usual, way.depths, out)
+        del frames
+    elif tiled is not None:
+        by_rows(tiled, way, _keys(view.plan, _parallel(view.plan) or []), out)
     else:
-        on_cpu(way, out, begun.sets if begun is not None and _still_holds(begun, way, s) else 0)
+        good = begun if begun is not None and _still_holds(begun, way, s) else None
+        on_cpu(way, out, good.sets if good is not None else 0, summed=good.summed if good is not None else None)
+    if begun is not None:
+        way = replace(way, frames=())
+        begun.let_go()
     no_margin = np.broadcast_to(np.float32(np.nan), (H, W))
     decoded = Decoded(
         view.plan.camera, (Direction(way.g, absolute, sigma, no_margin),), (), (), A, B, reasons, way.noise,
@@ -156,9 +166,14 @@ class Beginning:
         self._way: Way | None = None
         self._levels = np.zeros(0, np.float32)
         self._out: tuple[AnyArray, ...] = ()
+        self._few: list[tuple[FrameKey, AnyArray]] = []
+        self._summed: Summed | None = None
+        self._sum_s = 0.0  # that it took to add to the sums
 
-    def add(self, key: FrameKey, frame: AnyArray) -> None:
-        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it.
+    def add(self, key: FrameKey, frame: AnyArray, room_s: float = math.inf) -> None:
+        """Gather a frame; if a set is complete with it, work it out, and finer ones that have waited for it. A frame of
+        the finest set is added to its sums, with those that have not been yet, if that takes less than `room_s`, the
+        seconds until the next one may come.
 
         Raises CaptureError for a frame in the memory of another.
         """
@@ -168,6 +183,10 @@ class Beginning:
                 "needed frames that stay as they are: copy each one as it comes"
             )
         self.frames.append((key, frame))
+        if frame.ndim == 2 or self._view.plan.pixel_format.packs(frame):
+            every = denoise.odd_stride(math.prod(size_of(frame)))
+            few = phase.thinned(frame, self._view.plan.pixel_format, every)
+            self._few.append((key, np.ascontiguousarray(few)))
         while self._done < len(self._family) - 1 and len(self.frames) < len(self._view.plan.keys):
             got = _in_order(replace(self._view, frames=self.frames), self._family, self._done + 1)
             if got is None:
@@ -178,10 +197,27 @@ class Beginning:
                     self._family = []
                     return
                 self._way, self._levels = first
-                self._out = _room(*_size(got[0]))
+                self._out = room(*size_of(got[0]))
             self._way = replace(self._way, frames=got)
             on_cpu(self._way, self._out, self._done, self._done + 1)
             self._done += 1
+        if self._way is not None and self._done == len(self._family) - 1 and self._sum_s < room_s:
+            start = perf_counter()
+            self._sum_up(self._way)
+            self._sum_s = perf_counter() - start
+
+    def _sum_up(self, way: Way) -> None:
+        """Add what has come of the finest set, in the order of its frames, to the sums; its last frame is left."""
+        n, steps = self._family[-1][0], int(way.sets.start[-1] - way.sets.start[-2])
+        done = self._summed.frames if self._summed is not None else 0
+        there = {key.number: f for key, f in self.frames if key.set_index == n}
+        frames: list[AnyArray] = []
+        while done + len(frames) < steps - 1 and done + len(frames) in there:
+            frames.append(there[done + len(frames)])
+        like = way.frames[0]
+        if not frames or any(f.shape != like.shape or f.dtype != like.dtype for f in frames):
+            return
+        self._summed = cores.add(way, self._out, frames, self._summed)
 
     @property
     def begun(self) -> Begun | None:
@@ -189,13 +225,7 @@ class Beginning:
         way = self._way
         if way is None:
             return None
-        return Begun(self._done, way.noise, self._levels, self._out)
-
-
-def _room(H: int, W: int) -> tuple[AnyArray, ...]:
-    """The outputs of the kernel: phase, sigma, A, B, reasons, points, their sigma."""
-    absolute, sigma, A, B, sigma_mm = (memory.empty((H, W), np.float32) for _ in range(5))
-    return absolute, sigma, A, B, memory.empty((H, W), np.uint16), memory.empty((H, W, 3), np.float32), sigma_mm
+        return Begun(self._done, way.noise, self._levels, self._out, self._few, self.frames, self._summed)
 
 
 FIRST_SAMPLES = 50_000  #: pixels that tell the noise of the coarsest set alone
@@ -217,7 +247,7 @@ def _first_way(
     and high backgrounds.
     """
     plan, camera = view.plan, rig.camera(view.plan.camera)
-    H, W = _size(frames[0])
+    H, W = size_of(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
         return None
     g = family[-1][1]
@@ -226,16 +256,15 @@ def _first_way(
         return None
     alone = replace(plan, sets=(plan.sets[family[0][0]],))
 
-    def measured(samples: int) -> Decoded:
+    def thin(samples: int) -> list[tuple[FrameKey, AnyArray]]:
         every = denoise.odd_stride(H * W, samples)
-        thin = [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
-        return phase.measure(thin, alone, s.phase, view.noise)
+        return [(FrameKey(0, Role.STEP, n), phase.thinned(f, plan.pixel_format, every)) for n, f in enumerate(frames)]
 
-    few = measured(FIRST_SAMPLES)
+    few = phase.measure(thin(FIRST_SAMPLES), alone, s.phase, view.noise)
     steps = [_fringes(plan, n).steps for n, _ in family]
     limits = _limits(few.noise, plan.pixel_format, steps, math.inf, 0.0, s.phase.systematic_rad, s)
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
-    sets = _sets(family, steps, plan.pixel_format, measured(denoise.FEW).background)
+    sets = _sets(family, steps, plan.pixel_format, thin(denoise.FEW))
     levels = np.quantile(few.background, (0.1, 0.5, 0.9)).astype(np.float32)
     way = Way(
         frames, g, few.noise, (), table, sets, limits, _depths(table, rig, camera, s), bounds, np.ones((2, 2)),
@@ -243,20 +272,24 @@ def _first_way(
     return way, levels
 
 
-def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
-    """What the kernel needs to know of a view; None for one that it does not take."""
+def way_of(
+    view: ViewInput, rig: Rig, s: Settings, few_frames: Sequence[tuple[FrameKey, AnyArray]] | None = None
+) -> Way | None:
+    """What the kernel needs to know of a view; None for one that it does not take. `few_frames`: its frames thinned, if
+    they are already.
+    """
     plan, camera = view.plan, rig.camera(view.plan.camera)
     family = _parallel(plan) if takes(view) else None
     frames = _in_order(view, family) if family else None
     if frames is None or family is None:
         return None
-    H, W = _size(frames[0])
+    H, W = size_of(frames[0])
     if (camera.lens.width, camera.lens.height) != (W, H):
         return None  # the stages say what is wrong
     numbers, g = [n for n, _ in family], family[-1][1]
     steps = [_fringes(plan, n).steps for n in numbers]
     every = denoise.odd_stride(H * W)
-    thin = [(key, phase.thinned(f, plan.pixel_format, every)) for key, f in view.frames]
+    thin = few_frames or [(key, phase.thinned(f, plan.pixel_format, every)) for key, f in view.frames]
     few = phase.measure(thin, plan, s.phase, view.noise)
     if few.background is not few.sets[numbers[-1]].background:
         return None  # the finest set is not the most accurate one
@@ -267,15 +300,18 @@ def way_of(view: ViewInput, rig: Rig, s: Settings) -> Way | None:
     fmt = plan.pixel_format
     dark, low = denoise.weak(few, fmt, s.denoise)
     sigma_rad, contrast, usual = denoise.usual_exposure([few.sets[n] for n in numbers], ~(dark | low), s.denoise)
-    sets = _sets(family, steps, fmt, few.sets[numbers[0]].background)
+    sets = _sets(family, steps, fmt, [(key, f) for key, f in thin if key.set_index == numbers[0]])
     bounds = geometry.phase_bounds(rig, camera, g, s.denoise.volume_margin) / TWO_PI
     limits = _limits(few.noise, fmt, steps, sigma_rad, contrast, trial.systematic_rad, s)
     depths = _depths(table, rig, camera, s)
     return Way(frames, g, few.noise, trial.notes, table, sets, limits, depths, bounds, usual)
 
 
-def _sets(family: Family, steps: Sequence[int], fmt: PixelFormat, background: F32) -> k.Sets:
-    """The sets as the kernel has them; `background`: some of the coarsest one's."""
+def _sets(
+    family: Family, steps: Sequence[int], fmt: PixelFormat, coarsest: Sequence[tuple[FrameKey, AnyArray]]
+) -> k.Sets:
+    """The sets as the kernel has them; `coarsest`: some pixels of the frames of that set."""
+    usual = np.median(np.mean([f for _, f in coarsest], axis=0, dtype=np.float64)) if fmt.bits > 10 else 0.0
     g = family[-1][1]
     angles = np.concatenate([TWO_PI * np.arange(n) / n for n in steps])
     signs = np.repeat([1.0 if np.dot(h, g) > 0 else -1.0 for _, h in family], steps)  # of sets that point the other way
@@ -288,7 +324,7 @@ def _sets(family: Family, steps: Sequence[int], fmt: PixelFormat, background: F3
         frequency,
         np.array([np.dot(h, g) > 0 for _, h in family]),
         fmt.max_value,
-        f4(np.median(background) if fmt.bits > 10 else 0.0),
+        f4(round(float(usual))),  # whole, so that differences are exact
     )
 
 
@@ -323,7 +359,7 @@ def _in_order(view: ViewInput, family: Family, sets: int | None = None) -> tuple
         if key in there or (frame.ndim != 2 and not view.plan.pixel_format.packs(frame)):
             return None
         there[key] = frame
-    keys = [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(view.plan, n).steps)]
+    keys = _keys(view.plan, family)
     if sets is None and set(keys) != set(there):
         return None
     wanted = keys if sets is None else keys[: sum(_fringes(view.plan, n).steps for n, _ in family[:sets])]
@@ -336,9 +372,9 @@ def _in_order(view: ViewInput, family: Family, sets: int | None = None) -> tuple
     return frames if min(like.shape) >= 1 else None
 
 
-def _size(frame: AnyArray) -> tuple[int, int]:
-    """Rows and columns of pixels of a frame, which may be packed."""
-    return frame.shape[0], frame.shape[1] if frame.ndim == 2 else 2 * frame.shape[1]
+def _keys(plan: ViewPlan, family: Family) -> list[FrameKey]:
+    """Frames in the order of the sets, coarse to fine, step by step."""
+    return [FrameKey(n, Role.STEP, i) for n, _ in family for i in range(_fringes(plan, n).steps)]
 
 
 def _table(rig: Rig, camera: Camera, g: tuple[float, float], margin: float) -> geometry.DepthTable | None:
@@ -380,18 +416,3 @@ def _depths(table: geometry.DepthTable, rig: Rig, camera: Camera, s: Settings) -
         np.concatenate(geometry.lit_field(rig, camera, s.denoise.rim)).astype(f4),
         np.concatenate([a.ravel() for a in geometry.measuring_box(rig, camera, s.denoise.volume_margin)]).astype(f4),
     )
-
-
-def on_cpu(way: Way, out: tuple[AnyArray, ...], begin: int = 0, end: int | None = None) -> None:
-    """Runs the kernel over rows on all cores, on sets `begin` .. `end` - 1; it reads the frames where they lie, packed
-    ones too. Frames of later sets may be missing.
-    """
-    frames = [f if f[0].flags.c_contiguous else np.ascontiguousarray(f) for f in way.frames]
-    addresses, row_bytes = np.zeros(way.sets.start[-1], np.int64), np.zeros(way.sets.start[-1], np.int64)
-    addresses[: len(frames)] = [f.ctypes.data for f in frames]
-    row_bytes[: len(frames)] = [f.strides[0] for f in frames]
-    packed = frames[0].ndim == 3
-    like = np.empty(0, np.uint16 if packed else frames[0].dtype)
-    last = len(way.sets.frequency) if end is None else end
-    k.decode(begin, last, addresses, row_bytes, like, packed, way.sets, way.limits, way.bounds, way.usual, way.depths,
-             *out)  # fmt: skip

@@ -17,6 +17,7 @@ from fringescope.errors import CaptureError, RigError
 from fringescope.store import files
 from fringescope.store.images import Images, check_frame, check_header, split_page, write_png
 from fringescope.store.rig import parse_layout, read_model
+from fringescope.store.spool import Spool
 from fringescope.types import (
     AnyArray,
     FrameKey,
@@ -158,6 +159,32 @@ class Frames:
         return images.frame(view.files[view.plan.keys.index(key)], view.plan.pixel_format, view.size)
 
 
+class RowedFrames(Frames):
+    """As `Frames`, of which some rows can be had: from where they lie in files of plain samples (TIFF without
+    compression), from a temporary file for others, which are decoded once for it.
+    """
+
+    def __init__(self, capture: Capture, view: CaptureView) -> None:
+        super().__init__(capture, view)
+        self._spool: Spool | None = None
+
+    def rows(self, first: int, last: int) -> Iterator[tuple[FrameKey, AnyArray]]:
+        """Rows first to last - 1 of each frame. Raises as reading a frame does, and OutputError as `Spool`."""
+        view, images = self._view, Images(self._capture.folder)
+        plain = [images.plain(name) for name in view.files]
+        frames = list(zip(view.plan.keys, view.files, plain, strict=True))
+        if self._spool is None:
+            self._spool = Spool((key, self._read(name, images)) for key, name, lies in frames if lies is None)
+        spooled = self._spool.rows(first, last)
+        for key, name, lies in frames:
+            if lies is None:
+                yield next(spooled)
+                continue
+            some = lies.rows(first, last)
+            size = view.size if len(some) == lies.height else None
+            yield key, check_frame(some, view.plan.pixel_format, size, str(images.folder / name))
+
+
 # ------------------------------------------------------------------------------------------------------------ reading
 
 
@@ -278,14 +305,17 @@ def _set(s: _Set) -> tuple[FringeSet | GraySet, list[str]]:
     return FringeSet((g[0], g[1]), steps, s.exposure_us), list(s.frames)
 
 
-def view_inputs(capture: Capture, response: Response | None = None, *, ahead: bool = False) -> tuple[ViewInput, ...]:
+def view_inputs(
+    capture: Capture, response: Response | None = None, *, ahead: bool = False, rowed: bool = False
+) -> tuple[ViewInput, ...]:
     """What the pipeline takes: per view its plan, its frames (read lazily, may be iterated again) and its picture.
 
     `response` is the one that all views are to be freed from. `ahead` has the frames of a little capture read by other
-    threads from now on, in place of when they are asked for.
+    threads from now on, in place of when they are asked for. `rowed`: of frames that do not fit into memory, rows can
+    be had (`RowedFrames`).
     The ring-light picture is read at once. Raises CaptureError here, or while frames are read, naming the file.
     """
-    frames = {v.camera: Frames(capture, v) for v in capture.views}
+    frames = {v.camera: (RowedFrames if rowed else Frames)(capture, v) for v in capture.views}
     if ahead and sum(len(v.files) * math.prod(v.size) for v in capture.views) <= LITTLE:
         pool = ThreadPoolExecutor(READERS)
         for one in frames.values():

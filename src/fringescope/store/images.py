@@ -45,6 +45,28 @@ class Header(NamedTuple):
     bits: int
 
 
+class Plain(NamedTuple):
+    """Samples (H, W) that lie in a file as they are."""
+
+    path: Path
+    offset: int
+    height: int
+    width: int
+    dtype: np.dtype[Any]  #: with its order of bytes
+
+    def rows(self, first: int, last: int) -> AnyArray:
+        """Rows first to last - 1, read now, in the order of bytes of the machine. Raises CaptureError."""
+        last = min(last, self.height)
+        at = self.offset + first * self.width * self.dtype.itemsize
+        try:
+            out = np.fromfile(self.path, self.dtype, max(last - first, 0) * self.width, offset=at)
+        except OSError as e:
+            raise CaptureError(f"{self.path}: cannot read: {e.strerror or e}") from e
+        if out.size != max(last - first, 0) * self.width:
+            raise CaptureError(f"{self.path}: truncated; needed a frame that stays as it is")
+        return out.astype(self.dtype.newbyteorder("="), copy=False).reshape(-1, self.width)
+
+
 def split_page(name: str) -> tuple[str, int | None]:
     """ "file.tif#3" to ("file.tif", 3); any other name to (name, None)."""
     m = _PAGE.match(name)
@@ -181,6 +203,32 @@ class Images:
         """
         path = self.folder / name
         return check_frame(self.raw(name), pixel_format, size, str(path))
+
+    def plain(self, name: str) -> Plain | None:
+        """Where the samples (H, W) of a frame lie in its file, row after row; None where they lie there in any other
+        way, or cannot be had.
+        """
+        import tifffile
+
+        file, page = split_page(name)
+        path = self.folder / file
+        try:
+            _regular(path)
+            with path.open("rb") as f:
+                if f.read(4) not in _TIFF:
+                    return None
+            with _strict(), tifffile.TiffFile(path) as tif:
+                one = tif.pages[page or 0]
+                if not isinstance(one, tifffile.TiffPage) or not one.is_memmappable or one.samplesperpixel != 1:
+                    return None
+                out = Plain(
+                    path, one.dataoffsets[0], one.imagelength, one.imagewidth,
+                    np.dtype(one.dtype).newbyteorder(tif.byteorder),
+                )  # fmt: skip
+            whole = out.offset + out.height * out.width * out.dtype.itemsize <= path.stat().st_size
+            return out if whole and out.dtype.kind == "u" else None
+        except Exception:  # whoever reads it whole says what is wrong with it
+            return None
 
     def _page(self, file: str, page: int | None, data: bytes | None = None) -> tifffile.TiffPage:
         import tifffile
