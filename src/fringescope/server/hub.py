@@ -3,6 +3,9 @@
 Words of all cases wait in one queue; one task takes what waits, folds it into a copy of the truth, writes it in one
 transaction, and only then makes the copy the truth, answers and tells the rooms. What cannot be written did not happen,
 and nobody ever saw it. A stop does not wait for the disk: the projector is dark before it is written down.
+
+What people draw and remark is told once the operating system has it, which outlives this process however it ends; the
+disk has it an instant later. All else, what bears on light, rights and signatures, waits for the disk itself.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ INSTRUMENT = "instrument"
 _BATCH = 256  #: words written at once
 _BOOKS = 64  #: cases whose truth is kept ready
 _SAID = 1000  #: answers of each client that are kept ready; older ones are looked up in the log
+_EARLY = frozenset({"put", "remove", "layer", "comment", "withdraw", "undo"})  #: told before the disk has them
+_TIDY = 256  #: so many words, and the database's log ahead is brought into its file
 _OWED_S = 1.0  #: a stop that could not be written down is tried again so often
 _LOG = logging.getLogger("fringescope.hub")
 
@@ -98,6 +103,7 @@ class _Batch:
     after: list[Callable[[sa.Connection], None]] = field(default_factory=list)
     folds: list[tuple[_Waiting, Record, truth.Fold]] = field(default_factory=list)
     answers: list[tuple[_Waiting, Said]] = field(default_factory=list)
+    early: bool = False  #: told before the disk has it
 
 
 class Hub:
@@ -112,6 +118,10 @@ class Hub:
         self._queue: asyncio.Queue[_Waiting] = asyncio.Queue()
         self._books: dict[str, Book] = {}
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="log")
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="disk")
+        self._flushing: asyncio.Task[None] | None = None
+        self._unflushed = self._untidy = 0  #: words that the disk may not have, and all since it was last tidied up
+        self._cautious = False  #: the disk refused what was told: from then on every word waits for it
         self._task: asyncio.Task[None] | None = None
         self._ticks: asyncio.Task[None] | None = None
         self._numbers = 0
@@ -137,7 +147,10 @@ class Hub:
         if self._task is not None:
             await self._queue.join()
             self._task.cancel()
+        if self._flushing is not None:
+            await self._flushing
         self._writer.shutdown()
+        self._disk.shutdown()
 
     # ------------------------------------------------------------------------------------------------------- saying
 
@@ -273,7 +286,7 @@ class Hub:
                     self._queue.task_done()
 
     async def _take(self, waiting: list[_Waiting], again: bool = True) -> None:
-        batch = _Batch()
+        batch = _Batch(early=not self._cautious and all(w.kind in _EARLY for w in waiting))
         try:
             for w in waiting:
                 if w.case not in batch.books:
@@ -299,6 +312,9 @@ class Hub:
             self._refuse(waiting, f"{why}; nothing was changed")
             return
         self._keep(batch)
+        self._untidy += len(batch.records)
+        if batch.early or self._untidy >= _TIDY:
+            self._flush_soon(len(batch.records))
         for w, said in batch.answers:
             if not w.answer.done():
                 w.answer.set_result(said)
@@ -383,12 +399,33 @@ class Hub:
         batch.answers.append((w, said))
 
     def _commit(self, batch: _Batch) -> None:
-        with db.writing(self.engine) as c:
+        with db.writing(self.engine, batch.early) as c:
             for beside in batch.beside:
                 beside(c)
             journal.append(c, batch.records)
             for after in batch.after:
                 after(c)
+
+    def _flush_soon(self, words: int) -> None:
+        """Brings what was told to the disk, all that there is at once."""
+        self._unflushed += words
+        if self._flushing is None or self._flushing.done():
+            self._flushing = asyncio.create_task(self._flush(), name="disk")
+
+    async def _flush(self) -> None:
+        while self._unflushed:
+            self._unflushed = 0
+            tidy, self._untidy = self._untidy >= _TIDY, self._untidy % _TIDY
+            try:
+                await asyncio.get_running_loop().run_in_executor(self._disk, self._to_disk, tidy)
+            except (OutputError, sa.exc.SQLAlchemyError) as e:
+                self._cautious = True
+                _LOG.error("what was told may not be on the disk: %s; from now on every word waits for it", e)
+
+    def _to_disk(self, tidy: bool) -> None:
+        db.flush(self.engine)
+        if tidy:
+            db.tidy(self.engine)
 
     async def _follow_up(self, case: str, record: Record, fold: truth.Fold) -> None:
         if fold.refused:

@@ -60,8 +60,11 @@ async def _close(socket: WebSocket, code: int, why: str) -> None:
 
 
 @router.websocket("/api/cases/{case}/room")
-async def room(socket: WebSocket, case: str, since: int = 0) -> None:
-    """All events behind number `since`, then all that come; ops, pointers and ink the other way."""
+async def room(socket: WebSocket, case: str, since: int = 0, hash: str = "") -> None:
+    """All events behind number `since`, then all that come; ops, pointers and ink the other way.
+
+    `hash`: that of event `since`, as you had it; if the log has another there, all comes anew.
+    """
     asking = await _enter(socket, case, "case.read")
     if asking is None:
         return
@@ -77,7 +80,7 @@ async def room(socket: WebSocket, case: str, since: int = 0) -> None:
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(*EXPELLED)
         return
-    sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since)))
+    sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since), hash))
     receiver = asyncio.create_task(_receive(socket, asking, case, listener))
     listener.on_end = lambda: _end(sender)  # it may hang on a browser that does not read
     try:
@@ -98,12 +101,21 @@ def _end(task: asyncio.Task[None]) -> None:
     task.cancel()
 
 
-async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int) -> None:
+async def _send(
+    socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int, known: str
+) -> None:  # fmt: skip
     site, who = asking.site, asking.speaker
     now, seq = await site.hub.truth_of(case)
-    since = min(since, seq)
+
+    def other() -> bool:
+        with db.reading(site.engine) as c:
+            found = journal.read(c, case, since - 1, 1)
+        return not found or found[0].hash != known
+
+    anew = since > seq or bool(since and known and await run_in_threadpool(other))
+    since = 0 if anew else since
     here = site.rooms.present(case)
-    hello = Welcome(person=who.person, role=who.role.value, local=who.local, seq=seq, present=here)
+    hello = Welcome(person=who.person, role=who.role.value, local=who.local, seq=seq, present=here, anew=anew)
     await socket.send_text(hello.model_dump_json())
 
     def page(after: int) -> list[str]:
