@@ -215,7 +215,7 @@ def test_what_can_be_undone_is_bounded(monkeypatch: pytest.MonkeyPatch, hub: Ser
         assert case.state().strokes["s"]["stroke"]["pixels"][0][0] == 13.0
 
 
-# --------------------------------------------------------------------------------------------------- early, and the disk
+# -------------------------------------------------------------------------------------------- early, and the disk
 
 
 def test_drawing_is_told_before_the_disk_has_it_and_all_else_after(
@@ -305,7 +305,10 @@ def test_who_saw_what_a_power_cut_took_sees_all_anew(tmp_path: Path) -> None:
     for left in folder.glob("hub.sqlite*"):
         left.unlink()
     (tmp_path / "as-it-was").rename(folder / "hub.sqlite")
-    with Server(Config(folder, port=port), fast_passwords=True) as hub, Client(hub.url, "operator", PASSWORD) as again:
+    with (
+        Server(Config(folder, port=port), fast_passwords=True) as hub,
+        Client(hub.url, "operator", PASSWORD) as again,
+    ):
         room.case = again.case(case.id)
         room.reconnect()  # the log is shorter than what was seen
         assert [e.seq for e in room.events] == [1, 2, 3, 4]

@@ -371,9 +371,12 @@ class Instrument:
         found: dict[str, Any] = await self._devices.call("live", camera=camera, width=width, quality=quality)
         return found
 
-    async def shown(self) -> bool:
-        """Whether the projector itself says that it holds a picture. Raises DeviceError."""
-        return bool(await self._devices.call("shown"))
+    async def shown(self) -> int:
+        """Since when (`time.monotonic_ns`) the projector itself says that it holds a picture; 0 = it is dark.
+
+        Raises DeviceError.
+        """
+        return int(await self._devices.call("shown"))
 
     async def befall(self, what: dict[str, str]) -> None:
         """For the simulated instrument: something happens to the specimen."""

@@ -289,15 +289,16 @@ class Hand:
         if call.number < self._dark_from:  # while it was being turned on
             self._ready.dark()
             self._not_dark(call)
-        return {"shown_ns": time.time_ns()}
+        return {"shown_ns": time.time_ns() - max(0, time.monotonic_ns() - (self.shown(call) or time.monotonic_ns()))}
 
     def _not_dark(self, call: Call) -> None:
         if call.number < self._dark_from:
             raise RejectedError(STOPPED)
 
-    def shown(self, _call: Call) -> bool:
-        """Whether the projector itself says that it holds a picture."""
-        return self._opened().projector.shown is not None
+    def shown(self, _call: Call) -> int:
+        """Since when (`time.monotonic_ns`) the projector itself says that it holds a picture; 0 = it is dark."""
+        held = self._opened().projector.held
+        return 0 if held is None else held.at_ns
 
     def rest(self, _call: Call) -> None:
         """Dark, no watchdog, nobody looks: the devices are free."""
