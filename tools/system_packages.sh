@@ -4,7 +4,8 @@
 #
 #   python3-venv     make: the environment in .venv
 #   make, git        the tasks; tests that look at the tracked files
-#   nodejs, npm      Khronos' glTF validator, which judges surface.glb; checks of the viewer page's script
+#   nodejs, npm      Khronos' glTF validator, which judges surface.glb; a TypeScript compiler, which judges the page's
+#                    types; checks of the viewer page's script
 #   poppler-utils    prints board.pdf to a picture, as an outside reader of it
 #   postgresql       the hub's tests on PostgreSQL, which start a server of their own
 #   chromium         opens the viewer page without a screen and looks whether it draws
