@@ -159,10 +159,11 @@ class Hand:
         self._dark_from = 0  #: calls with a lower number were made before somebody said dark: they light nothing
         self.calls: dict[str, Callable[..., Any]] = {
             "open": self.open_, "close": self.close, "capture": self.capture, "ready": self.ready, "rest": self.rest,
-            "look": self.look, "live": self.live, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
+            "look": self.look, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
             "selftest": self.selftest, "shown": self.shown,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {"dark": self.dark, "beat": self.beat}
+        self.aside: dict[str, Callable[..., Any]] = {"live": self.live}  # who turns on the light waits for no video
 
     def _opened(self) -> Station:
         if self._station is None:
@@ -219,7 +220,8 @@ class Hand:
         photos: tuple[Any, ...] = (None,) * len(cameras)
         if station.light is not None:
             wanted = [v.pixel_format for v in plan.views]
-            photos = capturing.photograph(station.projector, cameras, station.light, wanted, s.capture)
+            with self._cameras:
+                photos = capturing.photograph(station.projector, cameras, station.light, wanted, s.capture)
 
         def counted(frames: Any, camera: str) -> Iterator[Any]:
             nonlocal done
@@ -236,7 +238,7 @@ class Hand:
                 yield ViewInput(view, counted(frames, view.camera), photo)
 
         try:
-            with store.new_folder(Path(out), marker="capture.json") as tmp:
+            with self._cameras, store.new_folder(Path(out), marker="capture.json") as tmp:
                 store.put_capture(tmp, i.width, i.height, i.layout, views(), {"instrument": self._uri})
         finally:
             station.projector.dark()
@@ -319,7 +321,8 @@ class Hand:
         call.progress("self-test", 0.0)
         station = self._opened()
         try:
-            found = self_test(station, store.read_rig(Path(rig)), s)
+            with self._cameras:
+                found = self_test(station, store.read_rig(Path(rig)), s)
         finally:
             station.projector.dark()
         figures = {"median_um": found.median_um, "p95_um": found.p95_um, "max_um": found.max_um}
