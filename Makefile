@@ -16,7 +16,7 @@ COMPILER := frontend/node_modules/.ready
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
 
-$(READY): constraints/dev.txt pyproject.toml tools/make_venv.sh
+$(READY): constraints/dev.txt constraints/meshopt.txt pyproject.toml tools/make_venv.sh
 	@tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 	@touch $@
 
