@@ -36,6 +36,7 @@ class Limits:
     waiting_letters: int = 16_000_000  #: and how long they may be together
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
+    peers: int = 6  #: of these by WebRTC: each is encoded by itself
 
 
 @dataclass(frozen=True)

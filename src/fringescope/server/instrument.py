@@ -68,6 +68,7 @@ class Instrument:
         self._open = False
         self._cameras: tuple[str, ...] = ()
         self.watching = 0  #: streams of video
+        self.peers = 0  #: of these by WebRTC
         self._hand = asyncio.Lock()  #: one thing at a time is done with the devices
         hub.carry_out = self.carry_out
         hub.dark = self.dark
