@@ -16,12 +16,13 @@ import numpy as np
 
 from fringescope.errors import OutputError
 from fringescope.export.glb import container, document, encode_picture, material, root_node
-from fringescope.types import F32, U32, Surface, SurfacePart
+from fringescope.types import F32, U8, U32, Surface, SurfacePart
 
 _LEVELS = 65535  #: of 16 bits
 _EXTENSIONS = ("EXT_meshopt_compression", "KHR_mesh_quantization")
 _ARRAY_BUFFER, _ELEMENT_BUFFER, _UINT16, _UINT32 = 34962, 34963, 5123, 5125
 _SHRINK = tuple((0.5 ** (k / 2), q) for k in range(9) for q in (85, 75, 60))  #: pictures: scale, and JPEG quality
+_WIDEST = 2048  #: pixels of a picture of the level that shows first
 
 Picture = tuple[bytes, str]  #: JPEG or PNG, and its media type
 
@@ -180,6 +181,14 @@ def packed_bytes(
     return container(root | {"extensionsRequired": list(_EXTENSIONS)}, bytes(b.data))
 
 
+def _shrunk(picture: U8, scale: float) -> U8:
+    h, w = picture.shape[:2]
+    if scale == 1:
+        return picture
+    size = max(1, round(w * scale)), max(1, round(h * scale))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def coarse_bytes(
     surface: Surface, triangles: int, most: int, extras: Mapping[str, Any] | None = None
 ) -> bytes:  # fmt: skip
@@ -190,14 +199,10 @@ def coarse_bytes(
     few = thinned(surface, triangles)
     parts = [p for p in few.parts if len(p.faces)]
     bare = len(packed_bytes(few, [(b"", "image/jpeg")] * len(parts), extras))
+    sources = [_shrunk(p.texture, min(1.0, _WIDEST / max(p.texture.shape[:2]))) for p in parts]
     pictures: list[Picture] = []
     for scale, quality in _SHRINK:
-        pictures = []
-        for part in parts:
-            h, w = part.texture.shape[:2]
-            size = max(1, round(w * scale)), max(1, round(h * scale))
-            small = part.texture if scale == 1 else cv2.resize(part.texture, size, interpolation=cv2.INTER_AREA)
-            pictures.append(encode_picture(np.asarray(small, np.uint8), quality))
+        pictures = [encode_picture(_shrunk(x, scale), quality) for x in sources]
         if bare + sum(len(raw) + 4 for raw, _ in pictures) <= most:
             break
     return packed_bytes(few, pictures, extras)
