@@ -20,7 +20,9 @@ from fringescope.server import hub as hub_module
 from fringescope.server import journal, truth
 from fringescope.server.config import Config, Limits
 from fringescope.server.hub import Hub
+from fringescope.server.rights import Speaker
 from fringescope.server.running import Server
+from fringescope.wire import Op, PersonRole
 from fringescope.wire.room import Said
 from tests.server.conftest import PASSWORD, SignIn, both, checked, populate
 from tests.server.test_hub import SCAN, invite, scanned, stroke
@@ -330,3 +332,28 @@ def test_who_saw_what_a_power_cut_took_sees_all_anew(tmp_path: Path) -> None:
         assert not room.welcome.anew
         room.close()
         assert checked(hub.site.engine)[1:] == (6, [])
+
+
+def test_words_behind_the_end_of_a_right_are_refused_until_it_comes_back(hub: Server, sign_in: SignIn) -> None:
+    """All in one batch: what waits behind the word that ended a right is not drawn; operators need no invitation."""
+    operator, expert = sign_in("operator"), sign_in("expert")
+    case = scanned(hub, operator)
+    gone, who = {"person": expert.me.person.id}, Speaker(expert.me.person.id, PersonRole.EXPERT)
+    other = Speaker(operator.me.person.id, PersonRole.OPERATOR)
+
+    def say(number: int, speaker: Speaker) -> Awaitable[Said]:
+        return hub.site.hub.say(case.id, speaker, Op(**put(number, f"s{number}", speaker.role.value)))
+
+    def word(kind: str, person: dict[str, str]) -> Awaitable[Said]:
+        return hub.site.hub.note(case.id, "somebody", "operator", kind, person)
+
+    said = on_loop(
+        hub, say(1, who), word("revoked", gone), say(2, who), word("revoked", {"person": other.person}), say(3, other),
+        word("invited", gone), say(4, who),
+    )  # fmt: skip
+    assert [bool(s.refused) for s in said] == [False, False, True, False, False, False, False]
+    assert said[2].refused == "your right to see this case has ended"
+    assert set(case.state().strokes) == {"s1", "s3", "s4"}
+    hub.site.hub.forget(case.id)  # and read again from the log
+    assert set(case.state().strokes) == {"s1", "s3", "s4"}
+    assert checked(hub.site.engine)[2] == []

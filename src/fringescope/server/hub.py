@@ -30,7 +30,7 @@ from fringescope.server import journal, truth
 from fringescope.server.accounts import Accounts
 from fringescope.server.clock import Clock
 from fringescope.server.rights import Speaker, refusal
-from fringescope.server.rooms import Rooms
+from fringescope.server.rooms import EXPELLED, Rooms
 from fringescope.settings import ExaminationSettings
 from fringescope.types.examination import Dark, GuardLost, Phase, Warn, What
 from fringescope.wire.ops import Op
@@ -42,6 +42,7 @@ _BATCH = 256  #: words written at once
 _BOOKS = 64  #: cases whose truth is kept ready
 _SAID = 1000  #: answers of each client that are kept ready; older ones are looked up in the log
 _EARLY = frozenset({"put", "remove", "layer", "comment", "withdraw", "undo"})  #: told before the disk has them
+_INVITED = ("expert", "observer")  #: who sees a case by invitation alone
 _TIDY = 256  #: so many words, and the database's log ahead is brought into its file
 _OWED_S = 1.0  #: a stop that could not be written down is tried again so often
 _LOG = logging.getLogger("fringescope.hub")
@@ -74,6 +75,13 @@ class Book:
     seq: int
     head: str
     said: dict[tuple[str, str], Heard]  #: by person and client
+    gone: frozenset[str] = frozenset()  #: whose right to see it was taken away
+
+    def admit(self, kind: str, payload: dict[str, Any]) -> None:
+        """Who comes and goes."""
+        person = payload.get("person")
+        if person and kind in ("invited", "joined", "revoked"):
+            self.gone = self.gone | {person} if kind == "revoked" else self.gone - {person}
 
 
 @dataclass(eq=False)
@@ -261,6 +269,7 @@ class Hub:
         for r in journal.entries(self.engine, case):
             if not r.refused:
                 book.truth = truth.follow(book.truth, r, self._settings).truth
+                book.admit(r.kind, r.payload or {})
             book.seq, book.head = r.seq, r.hash
             if r.actor != INSTRUMENT:  # it never says anything twice
                 book.said.setdefault((r.actor, r.client), Heard()).keep(r.number, r.seq, r.refused)
@@ -320,6 +329,8 @@ class Hub:
                 w.answer.set_result(said)
         for w, record, fold in batch.folds:
             self.rooms.event(w.case, as_event(record))
+            if record.kind == "revoked" and not record.refused and w.payload.get("person"):
+                self.rooms.expel(w.payload["person"], w.case)
             try:
                 await self._follow_up(w.case, record, fold)
             except Exception:  # the next ones are told all the same
@@ -378,6 +389,8 @@ class Hub:
             batch.answers.append((w, said))
             return
         book = batch.books[w.case]
+        if w.actor in book.gone and w.role in _INVITED and not w.refused:  # it waited behind the word that ended that
+            w.refused, w.payload = EXPELLED[1], {}
         bare = Record(
             w.case, book.seq + 1, self.clock.now_ns(), w.said_ns, w.actor, w.role, w.client, w.number, w.kind,
             w.refused, secrets.token_hex(16), w.payload, "", "",
@@ -387,6 +400,8 @@ class Hub:
             fold = truth.follow(book.truth, bare, self._settings)
         record = link(replace(bare, payload=fold.payload, refused=fold.refused), book.head)
         book.truth, book.seq, book.head = fold.truth, record.seq, record.hash
+        if not record.refused:
+            book.admit(record.kind, record.payload or {})
         if w.client != self._run:
             batch.said[w.case, w.actor, w.client, w.number] = (record.seq, record.refused)
         batch.records.append(record)
