@@ -8,6 +8,7 @@ BIN := $(VENV)/bin
 WORKERS ?= 2
 READY := $(VENV)/.ready
 VALIDATOR := tests/glb_validator/node_modules/.ready
+COMPILER := frontend/node_modules/.ready
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check bench docs verify reference pictures lock clean
@@ -15,19 +16,22 @@ VALIDATOR := tests/glb_validator/node_modules/.ready
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
 
-$(READY): constraints/dev.txt pyproject.toml tools/make_venv.sh
+$(READY): constraints/dev.txt constraints/meshopt.txt pyproject.toml tools/make_venv.sh
 	@tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 	@touch $@
 
-$(VALIDATOR): tests/glb_validator/package-lock.json tools/glb_validator.sh
-	@tools/glb_validator.sh
+$(VALIDATOR): tests/glb_validator/package-lock.json tools/npm_packages.sh
+	@tools/npm_packages.sh tests/glb_validator "the tests of surface.glb against Khronos' validator"
 
-setup: $(READY) $(VALIDATOR) ## the environment alone
+$(COMPILER): frontend/package-lock.json tools/npm_packages.sh
+	@tools/npm_packages.sh frontend "the test of the page's types by a TypeScript compiler"
+
+setup: $(READY) $(VALIDATOR) $(COMPILER) ## the environment alone
 
 demo: $(READY) ## scan a wet specimen on the simulated instrument and show the result
 	$(BIN)/fringescope demo --out build/demo --force
 
-test: $(READY) $(VALIDATOR) ## the tests
+test: $(READY) $(VALIDATOR) $(COMPILER) ## the tests
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile
 
 check: $(READY) ## lint and types; what CI runs before the tests
@@ -49,7 +53,7 @@ docs: $(READY) ## the documentation as a static site in build/docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
 	@echo "build/docs/index.html"
 
-verify: $(READY) $(VALIDATOR) ## the long statistical tests; goes on where it stopped, writes docs/evidence/
+verify: $(READY) $(VALIDATOR) $(COMPILER) ## the long statistical tests; goes on where it stopped, writes docs/evidence/
 	$(BIN)/python tools/verify.py
 
 reference: $(READY) ## write docs/reference/ anew from the code
@@ -62,4 +66,4 @@ lock: ## resolve constraints/ anew (needs uv from the package registry)
 	tools/lock.sh "$(PYTHON)"
 
 clean: ## remove what the targets made, the environment too
-	rm -rf build tests/glb_validator/node_modules "$(VENV)" .mypy_cache .ruff_cache .pytest_cache
+	rm -rf build tests/glb_validator/node_modules frontend/node_modules "$(VENV)" .mypy_cache .ruff_cache .pytest_cache

@@ -1,6 +1,10 @@
 """How long until the others see a stroke: a crowd in one room of a hub, some of them drawing.
 
     python benchmarks/hub.py [--clients 10] [--drawing 2] [--seconds 10] [--json]
+    python benchmarks/hub.py --confirm 30 [--device URI] [--json]
+
+The second form: how long from the operator's START, as their program sends it, until the simulated projector holds the
+picture, by the projector's own record. Both processes read the one monotonic clock of the machine.
 
 The hub runs in a process of its own, the crowd in this one. Ratios first: `stroke` (drawn, written down, seen by
 another) beside one synced transaction of SQLite on the same disk, `ink` (a piece of a stroke while it is drawn) beside
@@ -24,6 +28,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +38,7 @@ from typing import Any
 
 from websockets.asyncio.client import ClientConnection, connect
 
-from fringescope.client import Client
+from fringescope.client import Client, HubError
 
 CASE = "case-" + 20 * "0"
 PASSWORD = "correct horse battery"
@@ -42,16 +48,19 @@ _SEQ, _ID, _INK = re.compile(r'"seq":(\d+)'), re.compile(r'"id":"(\d+-\d+)-'), r
 _MARK, _HASH = re.compile(r'"layer":"(\d+)"'), re.compile(r'"hash":"([0-9a-f]{64})"}$')
 
 
-def serve(folder: Path, database: str | None) -> None:
+def serve(folder: Path, database: str | None, device: str | None) -> None:
     """The hub's process, with a case that has a scan: says where it is, ends when its input does."""
     from fringescope.server import cases
     from fringescope.server.config import Config, Limits
     from fringescope.server.running import Server
+    from fringescope.settings import from_dict
     from fringescope.types.examination import RigChanged, ScanTaken
     from fringescope.wire import PersonRole, Specimen
 
     limits = Limits(requests_per_s=1e6, requests_burst=10**6, logins_per_minute=1e6)
-    with Server(Config(folder, port=0, database=database, limits=limits), fast_passwords=True) as server:
+    patient = from_dict({"examination": {"verdict_s": 60.0}})  # a busy machine is slow to look: not what is timed here
+    config = Config(folder, port=0, database=database, limits=limits, instrument=device, settings=patient)
+    with Server(config, fast_passwords=True) as server:
         for role in (PersonRole.OPERATOR, PersonRole.EXPERT, PersonRole.OBSERVER):
             server.site.accounts.add(role.value, PASSWORD, role)
 
@@ -63,19 +72,25 @@ def serve(folder: Path, database: str | None) -> None:
             await said.tell(CASE, ScanTaken("scan", "rig"))
 
         assert server.loop is not None
-        asyncio.run_coroutine_threadsafe(scanned(), server.loop).result(20)
+        if device is None:
+            asyncio.run_coroutine_threadsafe(scanned(), server.loop).result(20)
         print(server.url, flush=True)
-        sys.stdin.read()
+        for _ in sys.stdin:  # each line asks since when the projector holds a picture
+            shown = asyncio.run_coroutine_threadsafe(server.site.instrument.shown(), server.loop)
+            print(shown.result(60), flush=True)
 
 
 @contextlib.contextmanager
-def hub(folder: Path, database: str | None) -> Iterator[tuple[str, int]]:
+def hub(
+    folder: Path, database: str | None, device: str | None = None
+) -> Iterator[tuple[str, subprocess.Popen[str]]]:  # fmt: skip
     """A hub in another process: its address and process."""
-    asked = [sys.executable, __file__, "--serve", str(folder), *(["--database", database] if database else [])]
+    asked = [sys.executable, __file__, "--serve", str(folder), *(["--database", database] if database else []),
+             *(["--device", device] if device else [])]  # fmt: skip
     with subprocess.Popen(asked, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
-            yield process.stdout.readline().strip(), process.pid
+            yield process.stdout.readline().strip(), process
         finally:
             process.communicate()
 
@@ -227,6 +242,94 @@ async def run(crowd: Crowd, clients: int, drawing: int, seconds: float, pid: int
     }  # fmt: skip
 
 
+def stroke_across(name: str, shift: float, camera: Any) -> dict[str, Any]:
+    """A line through the middle of a camera's picture."""
+    width, height = camera
+    pixels = [[width * (0.4 + 0.008 * i), height * 0.45 + shift + 0.002 * width * i] for i in range(25)]
+    return {"id": name, "camera": "camera1", "pixels": pixels, "width_mm": 0.8, "color": "#ffffff"}
+
+
+@contextlib.contextmanager
+def watching(case: Any, n: int) -> Iterator[list[int]]:
+    """So many who look at the live video of a case meanwhile; how many frames each has seen."""
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect as connect_here
+
+    cookies = "; ".join(f"{c.name}={c.value}" for c in case.hub.http.cookies.jar)
+    frames = [0] * n
+
+    def watch(k: int) -> None:
+        address = f"{case.hub.url.replace('http', 'ws', 1)}/api/cases/{case.id}/video/camera{k % 3 + 1}"
+        how = connect_here(address, additional_headers={"Cookie": cookies}, compression=None)
+        with contextlib.suppress(ConnectionClosed, TimeoutError), how as socket:
+            while not over.is_set():
+                told = json.loads(socket.recv(60))
+                if told["type"] == "frame":
+                    socket.recv(60)
+                    frames[k] += 1
+                    socket.send(json.dumps({"ack": told["number"]}))
+
+    over = threading.Event()
+    threads = [threading.Thread(target=watch, args=(k,), daemon=True) for k in range(n)]
+    for t in threads:
+        t.start()
+    try:
+        yield frames
+    finally:
+        over.set()
+        for t in threads:
+            t.join(60)
+
+
+def confirmed(url: str, process: subprocess.Popen[str], n: int, videos: int) -> dict[str, Any]:
+    """The operator at the instrument draws, previews, arms and starts `n` times."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    frame_ms, event_ms, answer_ms, again = [], [], [], 0
+    with Client(url, "operator", PASSWORD, timeout_s=300) as operator:
+        case = operator.open_case("bench")
+        case.scan("as received")
+        photo = next(f for f in case.scans()[0].files if f.name == "photo-camera1.jpg")
+        import cv2
+        import numpy as np
+
+        picture = cv2.imdecode(np.frombuffer(case.fetch(photo.sha256), np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None
+        with watching(case, videos) as frames, case.enter() as room:
+            heard: dict[str, float] = {}
+            room.on_event = lambda e: heard.__setitem__(e.kind, perf_counter())
+            for k in range(2 * n):
+                if len(frame_ms) == n:
+                    break
+                try:
+                    room.draw(stroke_across("cut", 0.02 * k, picture.shape[::-1]))
+                    version = room.wait(room.submit(), "checked")
+                    room.preview(version.number)
+                    version = room.arm(room.wait(version, "previewed", timeout_s=10))
+                    begun, sent_ns = perf_counter(), time.monotonic_ns()
+                    room.say({"kind": "start", "version": version.number, "pattern": version.pattern})
+                    answered = perf_counter()
+                    room.wait(version, "projecting", timeout_s=20)
+                    process.stdin.write("shown\n")
+                    process.stdin.flush()
+                    held_ns = int(process.stdout.readline())
+                    if held_ns <= sent_ns:
+                        raise HubError("the projector is dark")
+                except HubError:  # a busy machine kept its watchdog waiting: dark, so once more
+                    again += 1
+                    continue
+                finally:
+                    room.stop()
+                evidence = sum(1 for _ in room.heard("evidence"))
+                frame_ms.append((held_ns - sent_ns) / 1e6)
+                event_ms.append(1e3 * (heard["start"] - begun))
+                answer_ms.append(1e3 * (answered - begun))
+                with contextlib.suppress(HubError):  # the photographs of it are taken before the next
+                    room.until(lambda n=evidence: sum(1 for _ in room.heard("evidence")) > n, timeout_s=2)
+    return {"frame_ms": spread(frame_ms), "event_ms": spread(event_ms), "answer_ms": spread(answer_ms), "again": again,
+            "video_frames": frames}  # fmt: skip
+
+
 def spread(values: list[float]) -> dict[str, float]:
     """Median, 99th percentile and the longest."""
     if not values:
@@ -283,13 +386,33 @@ def main() -> None:
     ask.add_argument("--strokes", type=float, default=2, help="strokes a second, of each who draws")
     ask.add_argument("--database", help="URL; default: SQLite")
     ask.add_argument("--json", action="store_true")
+    ask.add_argument("--confirm", type=int, metavar="N", help="time N starts on the simulated instrument instead")
+    ask.add_argument("--videos", type=int, default=0, help="of the second form: so many watch live meanwhile")
+    ask.add_argument("--device", help="of the second form; default: a small simulated one")
     ask.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     given = ask.parse_args()
     if given.serve is not None:
-        serve(given.serve, given.database)
+        serve(given.serve, given.database, given.device)
+        return
+    if given.confirm is not None:
+        with tempfile.TemporaryDirectory(prefix="fringescope-bench-") as name:
+            folder, device = Path(name), given.device or "sim://paper/tissue-domed?scale=0.06&seed=3"
+            with hub(folder, given.database, device) as (url, process):
+                starts = confirmed(url, process, given.confirm, given.videos)
+            starts |= {"device": device, "synced_ms": round(synced_ms(folder), 3)}
+        if given.json:
+            print(json.dumps(starts))
+            return
+        frame, event = starts["frame_ms"], starts["event_ms"]
+        print(f"START to the projector's frame, {frame['n']} times on {device}, {given.videos} watch live: "
+              f"{frame['p50']} ms, "
+              f"99 %: {frame['p99']}, longest {frame['max']}; {starts['again']} tries more")  # fmt: skip
+        print(f"  of it until the event is written and told: {event['p50']} ms, 99 %: {event['p99']}; "
+              f"a synced transaction of SQLite: {starts['synced_ms']} ms")  # fmt: skip
         return
     made = tempfile.TemporaryDirectory(prefix="fringescope-bench-")
-    with made as name, hub(Path(name), given.database) as (url, pid):
+    with made as name, hub(Path(name), given.database) as (url, process):
+        pid = process.pid
         people = {role: Client(url, role, PASSWORD) for role in ("operator", "expert", "observer")}
         case = people["operator"].case(CASE)
         for role in ("expert", "observer"):

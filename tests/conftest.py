@@ -54,3 +54,13 @@ def gltf_validator() -> list[str]:
     if node is None or not (folder / "node_modules" / "gltf-validator").is_dir():
         pytest.skip("Khronos' glTF validator is not installed (make setup; it needs Node.js)")
     return [node, str(folder / "validate.mjs")]
+
+
+@pytest.fixture(scope="session")
+def meshopt_reader() -> list[str]:
+    """What unpacks a GLB by meshoptimizer's own decoder, as viewers do; append the file. Skipped by name."""
+    node = shutil.which("node")
+    folder = ROOT / "tests" / "glb_validator"
+    if node is None or not (folder / "node_modules" / "meshoptimizer").is_dir():
+        pytest.skip("meshoptimizer's decoder is not installed (make setup; it needs Node.js)")
+    return [node, str(folder / "unpack.mjs")]

@@ -81,6 +81,9 @@ CONFINED = {
     "rich": {"cli"},
     "matplotlib": {"report", "evaluate", "guide"},
     "embreex": {"twin"},
+    "meshoptimizer": {"export"},
+    "aiortc": {"server"},
+    "av": {"server"},
     "tifffile": {"store"},
     "pydantic": {"store", "server", "wire", "client"},
     "httpx": {"client", "server"},
@@ -240,7 +243,8 @@ def test_every_dependency_is_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     core, extras = project["dependencies"], project["optional-dependencies"]
     dev = [*core, *extras["test"], *extras["docs"], *extras["dev"]]
-    for name, wanted in (("core", core), ("dev", dev), ("gpu", [*core, *extras["gpu"]])):
+    for name, wanted in (("core", core), ("dev", dev), ("gpu", [*core, *extras["gpu"]]),
+                         ("meshopt", [*core, *extras["meshopt"]])):  # fmt: skip
         text = (ROOT / "constraints" / f"{name}.txt").read_text()
         pinned = {m.group(1).lower() for m in re.finditer(r"^([\w.-]+)==", text, re.M)}
         needed = {re.split(r"[\s\[<>=!~;]", d)[0].lower() for d in wanted} - {"fringescope"}

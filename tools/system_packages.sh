@@ -3,8 +3,10 @@
 # and pip are enough.
 #
 #   python3-venv     make: the environment in .venv
+#   g++, python3-dev meshoptimizer, which comes as source: surfaces packed for the wire
 #   make, git        the tasks; tests that look at the tracked files
-#   nodejs, npm      Khronos' glTF validator, which judges surface.glb; checks of the viewer page's script
+#   nodejs, npm      Khronos' glTF validator, which judges surface.glb; a TypeScript compiler, which judges the page's
+#                    types; checks of the viewer page's script
 #   poppler-utils    prints board.pdf to a picture, as an outside reader of it
 #   postgresql       the hub's tests on PostgreSQL, which start a server of their own
 #   chromium         opens the viewer page without a screen and looks whether it draws
@@ -13,13 +15,15 @@
 set -uo pipefail
 
 if ! command -v apt-get >/dev/null; then
-  echo "system packages: no apt-get here; install by hand what you miss: python3-venv make git nodejs npm poppler-utils chromium postgresql"
+  echo "system packages: no apt-get here; install by hand what you miss: python3-venv g++ python3-dev make git nodejs npm poppler-utils chromium postgresql"
   exit 0
 fi
 wanted=()
 command -v make >/dev/null || wanted+=(make)
 command -v git >/dev/null || wanted+=(git)
 python3 -c 'import ensurepip, venv' 2>/dev/null || wanted+=(python3-venv)
+command -v c++ >/dev/null || wanted+=(g++)
+python3 -c 'import sysconfig, os, sys; sys.exit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' 2>/dev/null || wanted+=(python3-dev)
 command -v node >/dev/null || wanted+=(nodejs)
 command -v npm >/dev/null || wanted+=(npm)
 command -v pdftoppm >/dev/null || wanted+=(poppler-utils)

@@ -508,7 +508,7 @@ export interface Ways {
   provider?: string | null;
 }
 
-/** The first message: who you are here, how far the log goes, who is in the room. */
+/** The first message: who you are here, how far the log goes, who is in the room. `anew`: what you have is not in the log any more, as after a power cut; forget it, all events come again. */
 export interface Welcome {
   type: "welcome";
   person: string;
@@ -516,6 +516,7 @@ export interface Welcome {
   local: boolean;
   seq: number;
   present: string[];
+  anew?: boolean;
 }
 
 export type WhatIsSaid = Put | Remove | Layer | Comment | Withdraw | Undo | Submit | Sign | Preview | Arm | Start | Acknowledge | Stop | CarryOver;

@@ -482,6 +482,29 @@ def test_a_scan_of_a_time_before_photographs_comes_in(elsewhere: Client, scan_fo
         case.add_scan(old)
 
 
+def test_surfaces_come_coarse_to_fine(elsewhere: Client, scan_folder: Path) -> None:
+    """Two packed levels beside the plain surface: content-addressed, in ranges, and from the scan that they say."""
+    if not export.can_pack():
+        pytest.skip("needs fringescope[meshopt]")
+    case = elsewhere.open_case("S20-9")
+    case.add_scan(scan_folder)
+    scan = case.scans()[0]
+    files = {f.name: f for f in scan.files}
+    plain = export.read_glb(scan_folder / "surface.glb")
+    for level, most in ((0, 20_000), (1, 200_000)):
+        f = files[f"level-{level}.glb"]
+        data = case.fetch(f.sha256)
+        assert (hashlib.sha256(data).hexdigest(), len(data), f.type) == (f.sha256, f.size, "model/gltf-binary")
+        told = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["asset"]["extras"]
+        assert (told["scan"], told["level"], told["of_triangles"]) == (scan.id, level, plain.n_faces)
+        assert told["triangles"] <= min(most, plain.n_faces)
+        part = case.hub.http.get(f"/api/cases/{case.id}/files/{f.sha256}", headers={"Range": "bytes=0-99"})
+        assert (part.status_code, part.content) == (206, data[:100])
+    assert files["level-0.glb"].size <= 700_000
+    assert files["level-1.glb"].size < files["surface.glb"].size
+    assert case.fetch(files["surface.glb"].sha256) == (scan_folder / "surface.glb").read_bytes()
+
+
 def test_a_second_scan_from_elsewhere_is_to_look_at_unless_asked(
     elsewhere: Client, scan_folder: Path, tmp_path: Path
 ) -> None:  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from fringescope import export
 from fringescope.client import Client, HubCase, HubError, HubVersion, Room
 from fringescope.errors import RejectedError
 from fringescope.server.config import Config
@@ -132,6 +133,8 @@ def test_a_scan_is_there_for_all_with_its_files(case: HubCase) -> None:
     (scan,) = case.scans()
     names = {f.name: f for f in scan.files}
     assert {"scan.json", "cloud.ply", "surface.glb", "preview.glb", "photo-camera1.jpg"} <= set(names)
+    if export.can_pack():
+        assert {"level-0.glb", "level-1.glb"} <= set(names)
     assert scan.label == "as received"
     assert case.state().scans == [scan.id]
     glb = names["preview.glb"]

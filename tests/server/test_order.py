@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import sqlite3
+import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,10 +17,12 @@ from fringescope.client import Client, HubCase, HubError
 from fringescope.errors import OutputError
 from fringescope.server import database as db
 from fringescope.server import hub as hub_module
-from fringescope.server import truth
+from fringescope.server import journal, truth
 from fringescope.server.config import Config, Limits
 from fringescope.server.hub import Hub
+from fringescope.server.rights import Speaker
 from fringescope.server.running import Server
+from fringescope.wire import Op, PersonRole
 from fringescope.wire.room import Said
 from tests.server.conftest import PASSWORD, SignIn, both, checked, populate
 from tests.server.test_hub import SCAN, invite, scanned, stroke
@@ -209,3 +215,145 @@ def test_what_can_be_undone_is_bounded(monkeypatch: pytest.MonkeyPatch, hub: Ser
         assert len(on_loop(hub, hub.site.hub.truth_of(case.id))[0][0].done) == 3
         room.undo()
         assert case.state().strokes["s"]["stroke"]["pixels"][0][0] == 13.0
+
+
+# -------------------------------------------------------------------------------------------- early, and the disk
+
+
+def test_drawing_is_told_before_the_disk_has_it_and_all_else_after(
+    hub: Server, sign_in: SignIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What SQLite itself says of the connection that is about to be committed: 1 = NORMAL, 2 = FULL."""
+    seen: dict[str, int] = {}
+    real = journal.append
+
+    def append(c: sa.Connection, records: Any) -> None:
+        seen.update({r.kind: c.exec_driver_sql("PRAGMA synchronous").scalar() for r in records})
+        real(c, records)
+
+    monkeypatch.setattr(journal, "append", append)
+    case = scanned(hub, sign_in("operator"))
+    with case.enter() as room:
+        room.draw(stroke("s"))
+        room.say({"kind": "comment", "comment": "c", "text": "here"})
+        room.undo()
+        room.submit()
+        room.stop()
+    early = {"put", "comment", "undo"}
+    assert early | {"submit", "stop", "opened", "ScanTaken"} <= set(seen)
+    assert {k: v for k, v in seen.items() if v != (1 if k in early else 2)} == {}
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
+def test_the_disk_has_it_an_instant_later(hub: Server, sign_in: SignIn, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[str] = []
+    real = os.fdatasync
+
+    def fdatasync(number: int) -> None:
+        real(number)
+        synced.append(Path(f"/proc/self/fd/{number}").readlink().name)
+
+    case = scanned(hub, sign_in("operator"))
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    with case.enter() as room:
+        room.draw(stroke("s"))
+        end = time.monotonic() + 10
+        while "hub.sqlite-wal" not in synced and time.monotonic() < end:
+            time.sleep(0.01)
+    assert "hub.sqlite-wal" in synced
+
+
+def test_a_disk_that_refused_what_was_told_is_waited_for_from_then_on(
+    hub: Server, sign_in: SignIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    early: list[bool] = []
+    real = Hub._commit
+
+    def commit(self: Hub, batch: Any) -> None:
+        early.append(batch.early)
+        real(self, batch)
+
+    def refuses(_: Any) -> None:
+        raise OutputError("the disk did not take it: input/output error")
+
+    case = scanned(hub, sign_in("operator"))
+    with case.enter() as room:
+        monkeypatch.setattr(Hub, "_commit", commit)
+        monkeypatch.setattr(db, "flush", refuses)
+        room.draw(stroke("s"))
+        end = time.monotonic() + 10
+        while not hub.site.hub._cautious and time.monotonic() < end:
+            time.sleep(0.01)
+        monkeypatch.setattr(db, "flush", lambda _: None)
+        room.draw(stroke("t"))
+    assert early == [True, False]
+
+
+def test_who_saw_what_a_power_cut_took_sees_all_anew(tmp_path: Path) -> None:
+    """The database as it was some events ago; the log goes on in another way, and somebody comes back."""
+    folder = tmp_path / "hub"
+    with Server(Config(folder, port=0), fast_passwords=True) as hub:
+        populate(hub)
+        with Client(hub.url, "operator", PASSWORD) as operator:
+            case = scanned(hub, operator)
+            with case.enter() as room:
+                room.draw(stroke("kept"))
+                with sqlite3.connect(folder / "hub.sqlite") as a, sqlite3.connect(tmp_path / "as-it-was") as b:
+                    a.backup(b)
+                room.draw(stroke("lost"))
+                room.draw(stroke("lost too"))
+                assert room.seq == 6
+        port = hub.config.port
+    for left in folder.glob("hub.sqlite*"):
+        left.unlink()
+    (tmp_path / "as-it-was").rename(folder / "hub.sqlite")
+    with (
+        Server(Config(folder, port=port), fast_passwords=True) as hub,
+        Client(hub.url, "operator", PASSWORD) as again,
+    ):
+        room.case = again.case(case.id)
+        room.reconnect()  # the log is shorter than what was seen
+        assert [e.seq for e in room.events] == [1, 2, 3, 4]
+        room.close()
+        with again.case(case.id).enter() as other:
+            other.draw(stroke("new"))
+            other.draw(stroke("new too"))
+        room._seq, stale = 5, room.events[-1].model_copy(update={"seq": 5, "hash": "0" * 64})
+        room.events.append(stale)
+        room.reconnect()  # it is as long, but another
+        room.until(lambda: room.seq == 6)
+        assert [e.seq for e in room.events] == [1, 2, 3, 4, 5, 6]
+        assert stale.hash not in {e.hash for e in room.events}
+        before = room.events[-1]
+        room.close()
+        room.reconnect()  # nothing happened: nothing comes again
+        assert room.events[-1] is before
+        assert room.welcome is not None
+        assert not room.welcome.anew
+        room.close()
+        assert checked(hub.site.engine)[1:] == (6, [])
+
+
+def test_words_behind_the_end_of_a_right_are_refused_until_it_comes_back(hub: Server, sign_in: SignIn) -> None:
+    """All in one batch: what waits behind the word that ended a right is not drawn; operators need no invitation."""
+    operator, expert = sign_in("operator"), sign_in("expert")
+    case = scanned(hub, operator)
+    gone, who = {"person": expert.me.person.id}, Speaker(expert.me.person.id, PersonRole.EXPERT)
+    other = Speaker(operator.me.person.id, PersonRole.OPERATOR)
+
+    def say(number: int, speaker: Speaker) -> Awaitable[Said]:
+        return hub.site.hub.say(case.id, speaker, Op(**put(number, f"s{number}", speaker.role.value)))
+
+    def word(kind: str, person: dict[str, str]) -> Awaitable[Said]:
+        return hub.site.hub.note(case.id, "somebody", "operator", kind, person)
+
+    said = on_loop(
+        hub, say(1, who), word("revoked", gone), say(2, who), word("revoked", {"person": other.person}), say(3, other),
+        word("invited", gone), say(4, who),
+    )  # fmt: skip
+    assert [bool(s.refused) for s in said] == [False, False, True, False, False, False, False]
+    assert said[2].refused == "your right to see this case has ended"
+    assert set(case.state().strokes) == {"s1", "s3", "s4"}
+    hub.site.hub.forget(case.id)  # and read again from the log
+    assert set(case.state().strokes) == {"s1", "s3", "s4"}
+    assert checked(hub.site.engine)[2] == []

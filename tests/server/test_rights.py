@@ -108,7 +108,8 @@ ROUTES: dict[str, Row] = {
     "POST /api/cases/{case}/scans/import": Row("operator", 202, {}),
     "POST /api/cases/{case}/erase": Row("admin", 200, {"why": "asked for"}, fresh=True),
 }
-SOCKETS = {"/api/cases/{case}/room": ALL, "/api/cases/{case}/video/{camera}": TALK}
+SOCKETS = {"/api/cases/{case}/room": ALL, "/api/cases/{case}/video/{camera}": TALK,
+           "/api/cases/{case}/webrtc/{camera}": TALK}  # fmt: skip
 
 #: what somebody says: who may, and how it looks
 SAID: dict[str, tuple[str, dict[str, Any]]] = {

@@ -74,3 +74,18 @@ def test_a_crowd_for_five_minutes(root: Path, clients: int, record_property: Any
     found = crowd(root, "--clients", str(clients), "--seconds", "300", "--rate", rate, record=record_property)
     holds(found)
     assert grown_mb(found) < 40
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("videos", [0, 2])
+def test_a_start_is_a_frame_within_200_ms(root: Path, videos: int, record_property: Any) -> None:
+    """By the projector's own record; also while others watch live video."""
+    asked = [sys.executable, str(root / "benchmarks" / "hub.py"), "--json", "--confirm", "30", "--videos", str(videos)]
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=590, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    found: dict[str, Any] = json.loads(done.stdout)
+    for name in ("frame_ms", "event_ms", "synced_ms", "again"):
+        record_property(name, found[name])
+    assert found["frame_ms"]["n"] == 30
+    assert found["frame_ms"]["p99"] <= 200
+    assert all(found["video_frames"]) or not videos

@@ -50,15 +50,22 @@ def test_a_compiler_takes_them(tmp_path: Path) -> None:
     tsc = next((p for p in (ROOT / "frontend" / "node_modules" / ".bin" / "tsc",) if p.exists()), None)
     found = str(tsc) if tsc else shutil.which("tsc")
     if found is None:
-        pytest.skip("no TypeScript compiler here: npm install -g typescript")
+        pytest.skip("no TypeScript compiler here: make setup, with Node.js (tools/system_packages.sh)")
     sample = tmp_path / "sample.ts"
     sample.write_text(
         f'import type {{ Op, FromServer }} from "{ROOT / "frontend" / "src" / "wire"}";\n'
         'export const op: Op = { client: "c", number: 1, what: { kind: "stop" } };\n'
         'export function seq(m: FromServer): number { return m.type === "event" ? m.seq : 0; }\n'
     )
-    done = subprocess.run([found, "--noEmit", "--strict", str(sample)], capture_output=True, text=True)
+    strict = ["--noEmit", "--strict", "--noUncheckedIndexedAccess", "--exactOptionalPropertyTypes"]
+
+    def compiled() -> subprocess.CompletedProcess[str]:
+        return subprocess.run([found, *strict, str(sample)], capture_output=True, text=True, check=False)
+
+    done = compiled()
     assert done.returncode == 0, done.stdout
+    sample.write_text(sample.read_text().replace('kind: "stop"', 'kind: "stopp"'))
+    assert compiled().returncode != 0  # it looks
 
 
 def test_what_is_said_is_no_word_of_the_instrument() -> None:

@@ -54,7 +54,8 @@ class Room:
     """A connection to the room of a case. `events` holds the log as far as it came, in its order and each once.
 
     Words are answered: a method that says something raises HubError where nothing came of it. After a lost connection
-    `reconnect` goes on where it stopped, and says again what was not answered: it is done once.
+    `reconnect` goes on where it stopped, and says again what was not answered: it is done once. If the log lost its end
+    meanwhile (a power cut), `events` begins anew.
     """
 
     def __init__(self, case: HubCase, since: int = 0) -> None:
@@ -83,6 +84,8 @@ class Room:
         hub = self.case.hub
         scheme, rest = hub.url.split("://", 1)
         url = f"{'wss' if scheme == 'https' else 'ws'}://{rest}/api/cases/{self.case.id}/room?since={self._seq}"
+        if self.events:
+            url += f"&hash={self.events[-1].hash}"
         cookies = "; ".join(f"{c.name}={c.value}" for c in hub.http.cookies.jar)
         self.closed = ""
         self._open = ExitStack()
@@ -168,6 +171,10 @@ class Room:
             self.relayed.put(m)
         elif isinstance(m, Welcome):
             self.welcome = m
+            if m.anew:
+                with self._news:
+                    self._seq = 0
+                    self.events.clear()
         elif isinstance(m, CaughtUp):
             self._caught_up.set()
         elif isinstance(m, Refusal):

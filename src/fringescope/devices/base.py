@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -292,7 +293,7 @@ class Projector(Device, ABC):
             if self._running is not None:
                 self.dark()
             self._show(own, leds)
-            self._held = Held(own, leds)
+            self._held = Held(own, leds, time.monotonic_ns())
 
     def dark(self) -> None:
         """Nothing is projected any more within 100 ms; a shot that runs ends. May be called in any state, any number of

@@ -67,6 +67,7 @@ class Held:
 
     image: U8
     leds: Leds
+    at_ns: int = 0  #: since when, `time.monotonic_ns`
 
 
 @dataclass(frozen=True, eq=False)

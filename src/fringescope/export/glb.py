@@ -89,39 +89,58 @@ def glb_bytes(surface: Surface, extras: Mapping[str, Any] | None = None, quality
             "mode": 4,
             "extras": {"view": part.view},
         })
-        materials.append({
-            "name": f"view {part.view}",
-            "pbrMetallicRoughness": {"baseColorTexture": {"index": len(textures)}, "metallicFactor": 0.0,
-                                     "roughnessFactor": 0.9},
-            "doubleSided": True,
-        } | ({} if lit else {"extensions": {"KHR_materials_unlit": {}}}))
+        materials.append(material(part.view, len(textures), lit))
         textures.append({"sampler": 0, "source": len(images)})
         images.append({"name": f"picture {i}", "mimeType": mime, "bufferView": b.view(picture)})
     if not primitives:
         raise OutputError("a surface without triangles; GLB needs at least one")
     b.data += b"\0" * (-len(b.data) % 4)
+    parts = {"meshes": [{"name": "surface", "primitives": primitives}], "materials": materials, "textures": textures,
+             "images": images, "accessors": b.accessors, "bufferViews": b.views,
+             "buffers": [{"byteLength": len(b.data)}]}
+    return container(document(parts, [root_node({"mesh": 0})], () if lit else ("KHR_materials_unlit",), extras),
+                     bytes(b.data))
+
+
+def material(view: int, texture: int, lit: bool = False) -> dict[str, Any]:
+    """The material of what one view textures."""
+    core = {
+        "name": f"view {view}",
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": texture}, "metallicFactor": 0.0,
+                                 "roughnessFactor": 0.9},
+        "doubleSided": True,
+    }
+    return core if lit else core | {"extensions": {"KHR_materials_unlit": {}}}
+
+
+def root_node(more: Mapping[str, Any]) -> dict[str, Any]:
+    """The node that makes metres, y up, of our mm, z up."""
     half = math.sqrt(0.5)
+    return {"name": "world_mm", **more, "scale": [0.001] * 3, "rotation": [-half, 0.0, 0.0, half]}
+
+
+def document(
+    parts: Mapping[str, Any], nodes: list[dict[str, Any]], used: tuple[str, ...], extras: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """A glTF of one scene, whose root is the first of the nodes."""
     root: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "fringescope", "extras": {"units": "mm", "up": "z", **(extras or {})}},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "world_mm", "mesh": 0, "scale": [0.001] * 3, "rotation": [-half, 0.0, 0.0, half]}],
-        "meshes": [{"name": "surface", "primitives": primitives}],
-        "materials": materials,
-        "textures": textures,
-        "images": images,
+        "nodes": nodes,
+        **parts,
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "accessors": b.accessors,
-        "bufferViews": b.views,
-        "buffers": [{"byteLength": len(b.data)}],
     }
-    if not lit:
-        root["extensionsUsed"] = ["KHR_materials_unlit"]
+    return root | {"extensionsUsed": list(used)} if used else root
+
+
+def container(root: Mapping[str, Any], binary: bytes) -> bytes:
+    """A glTF and its binary chunk, padded to 4 bytes already, as GLB."""
     text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + len(b.data)
+    size = 12 + 8 + len(text) + 8 + len(binary)
     return (struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text
-            + struct.pack("<I4s", len(b.data), b"BIN\0") + bytes(b.data))
+            + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
 
 
 def write_glb(surface: Surface, target: Target, extras: Mapping[str, Any] | None = None, quality: int = 90,

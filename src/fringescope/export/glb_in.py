@@ -33,7 +33,20 @@ def read_glb(path: str | Path) -> Surface:
         raise FormatError(f"{path}: not a surface of this program, or truncated ({type(e).__name__}: {e})") from e
 
 
-def _surface(data: bytes) -> Surface:
+def read_pictures(path: str | Path) -> list[tuple[bytes, str]]:
+    """The pictures of a `surface.glb` as they lie there, with their media types, in the order of its parts.
+
+    Raises FormatError.
+    """
+    try:
+        doc, binary = _chunks(Path(path).read_bytes())
+        views = [(doc["bufferViews"][i["bufferView"]], i["mimeType"]) for i in doc["images"]]
+        return [(binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]], str(mime)) for v, mime in views]
+    except (OSError, KeyError, IndexError, TypeError, ValueError, struct.error) as e:
+        raise FormatError(f"{path}: not a surface of this program, or truncated ({type(e).__name__}: {e})") from e
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     magic, version, size = struct.unpack_from("<4sII", data, 0)
     if magic != b"glTF" or version != 2 or size != len(data):
         raise ValueError("needed a whole glTF 2 binary")
@@ -42,7 +55,11 @@ def _surface(data: bytes) -> Surface:
     _, kind2 = struct.unpack_from("<I4s", data, 20 + length)
     if kind != b"JSON" or kind2 != b"BIN\0":
         raise ValueError("needed a JSON and a binary chunk")
-    binary = data[28 + length :]
+    return doc, data[28 + length :]
+
+
+def _surface(data: bytes) -> Surface:
+    doc, binary = _chunks(data)
 
     def view(i: int) -> bytes:
         v = doc["bufferViews"][i]

@@ -20,7 +20,7 @@ from fringescope.errors import FringescopeError, OutputError
 from fringescope.server.asking import one_line
 from fringescope.server.config import Config
 from fringescope.server.database import HeldError
-from fringescope.server.routes import audit, cases, leaving, passkeys, people, room, scans, signing
+from fringescope.server.routes import audit, cases, leaving, passkeys, people, room, scans, signing, video
 from fringescope.server.security import Guarded
 from fringescope.server.site import Site, open_site
 
@@ -61,7 +61,7 @@ def make_app(config: Config, hasher: argon2.PasswordHasher | None = None) -> Fas
         openapi_url="/openapi.json",
     )
     app.state.site = site
-    for part in (signing, passkeys, people, leaving, cases, scans, audit, room):
+    for part in (signing, passkeys, people, leaving, cases, scans, audit, room, video):
         app.include_router(part.router)
     _explain(app)
     app.add_middleware(Guarded, config=config, requests=site.requests)

@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from fringescope.errors import FormatError, FringescopeError, OutputError
+from fringescope.server import database as db
 from fringescope.server import journal
 from fringescope.server.clock import Clock
 from fringescope.wire.record import canonical
@@ -164,6 +165,7 @@ class Checkpoints:
     def _write(self) -> Path | None:
         now = self._clock.now_ns()
         heads = journal.heads(self._engine)
+        db.flush(self._engine)  # a checkpoint tells of nothing that a power cut could take back
         file = self._folder / f"{datetime.datetime.fromtimestamp(now / 1e9, datetime.UTC):%Y-%m-%d}.jsonl"
         whole = self._file != file
         moved = heads if whole else {k: v for k, v in heads.items() if self._told.get(k) != v}

@@ -39,6 +39,7 @@ class Limits:
     present: int = 400  #: connections to one room
     videos: int = 40  #: streams of video
     videos_each: int = 10  #: of one person: two pages with all cameras
+    peers: int = 6  #: of these by WebRTC: each is encoded by itself
     bundles_each: int = 2  #: bundles that one person takes at once: each lies on the disk meanwhile
     connections: int = 2000  #: open connections from other machines
     connections_each: int = 500  #: of one address

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -157,6 +158,7 @@ jobs = sa.Table(
     sa.Column("ended_ns", Big),
 )  # fmt: skip
 
+_PAGES_AT_WORST = 8000  #: of SQLite's log ahead, before a commit stops to bring them into its file
 _HELD = 0x6672696E67650001  #: the number of our lock among a database's advisory ones
 MIGRATIONS = Path(__file__).with_name("migrations")
 
@@ -183,21 +185,30 @@ def _set_up_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # transactions begin where `_begin_at_once` says, not where the driver guesses
     cursor = connection.cursor()
     for line in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=10000",
+                 f"wal_autocheckpoint={_PAGES_AT_WORST}",
                  "secure_delete=ON"):  # fmt: skip  # what is erased is overwritten
         cursor.execute(f"PRAGMA {line}")
     cursor.close()
 
 
 def _begin_at_once(connection: sa.Connection) -> None:
-    readonly = connection.get_execution_options().get("reads", False)
-    connection.exec_driver_sql("BEGIN" if readonly else "BEGIN IMMEDIATE")
+    options = connection.get_execution_options()
+    if options.get("reads", False):
+        connection.exec_driver_sql("BEGIN")
+        return
+    connection.exec_driver_sql(f"PRAGMA synchronous={'NORMAL' if options.get('early', False) else 'FULL'}")
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
 @contextmanager
-def writing(engine: sa.Engine) -> Iterator[sa.Connection]:
-    """A transaction that changes something. Raises OutputError where the disk is full or nobody answers."""
+def writing(engine: sa.Engine, early: bool = False) -> Iterator[sa.Connection]:
+    """A transaction that changes something. Raises OutputError where the disk is full or nobody answers.
+
+    `early`: SQLite does not wait for the disk. What was written outlives this process, however it ends, but a power cut
+    only once `flush` has returned.
+    """
     try:
-        with engine.begin() as connection:
+        with engine.connect().execution_options(early=early) as connection, connection.begin():
             yield connection
     except sa.exc.OperationalError as e:
         raise OutputError(f"the database cannot be written: {e.orig}; nothing was changed") from e
@@ -208,6 +219,36 @@ def reading(engine: sa.Engine) -> Iterator[sa.Connection]:
     """A transaction that only looks."""
     with engine.connect().execution_options(reads=True) as connection:
         yield connection
+
+
+def flush(engine: sa.Engine) -> None:
+    """Waits until all that was written early is on the disk. Raises OutputError."""
+    if engine.dialect.name != "sqlite":
+        return
+    try:
+        number = os.open(_ahead(engine), os.O_RDWR)
+    except FileNotFoundError:
+        return  # nothing waits
+    except OSError as e:
+        raise OutputError(f"{_ahead(engine)}: {e.strerror}") from e
+    try:
+        getattr(os, "fdatasync", os.fsync)(number)
+    except OSError as e:
+        raise OutputError(f"{_ahead(engine)}: the disk did not take it: {e.strerror}") from e
+    finally:
+        os.close(number)
+
+
+def tidy(engine: sa.Engine) -> None:
+    """Brings SQLite's log ahead into its file, beside the commits: so none of them has to stop for that."""
+    if engine.dialect.name == "sqlite":
+        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as c:
+            connection: Any = c.connection.dbapi_connection
+            connection.execute("PRAGMA wal_checkpoint(PASSIVE)")
+
+
+def _ahead(engine: sa.Engine) -> Path:
+    return Path(f"{engine.url.database}-wal")
 
 
 def forget_erased(engine: sa.Engine) -> None:

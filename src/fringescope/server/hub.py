@@ -3,6 +3,9 @@
 Words of all cases wait in one queue; one task takes what waits, folds it into a copy of the truth, writes it in one
 transaction, and only then makes the copy the truth, answers and tells the rooms. What cannot be written did not happen,
 and nobody ever saw it. A stop does not wait for the disk: the projector is dark before it is written down.
+
+What people draw and remark is told once the operating system has it, which outlives this process however it ends; the
+disk has it an instant later. All else, what bears on light, rights and signatures, waits for the disk itself.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from fringescope.server import journal, truth
 from fringescope.server.accounts import Accounts
 from fringescope.server.clock import Clock
 from fringescope.server.rights import Speaker, refusal
-from fringescope.server.rooms import Rooms
+from fringescope.server.rooms import EXPELLED, Rooms
 from fringescope.settings import ExaminationSettings
 from fringescope.types.examination import Dark, GuardLost, Phase, Warn, What
 from fringescope.wire.ops import Op
@@ -38,6 +41,9 @@ INSTRUMENT = "instrument"
 _BATCH = 256  #: words written at once
 _BOOKS = 64  #: cases whose truth is kept ready
 _SAID = 1000  #: answers of each client that are kept ready; older ones are looked up in the log
+_EARLY = frozenset({"put", "remove", "layer", "comment", "withdraw", "undo"})  #: told before the disk has them
+_INVITED = ("expert", "observer")  #: who sees a case by invitation alone
+_TIDY = 256  #: so many words, and the database's log ahead is brought into its file
 _OWED_S = 1.0  #: a stop that could not be written down is tried again so often
 _LOG = logging.getLogger("fringescope.hub")
 
@@ -69,6 +75,13 @@ class Book:
     seq: int
     head: str
     said: dict[tuple[str, str], Heard]  #: by person and client
+    gone: frozenset[str] = frozenset()  #: whose right to see it was taken away
+
+    def admit(self, kind: str, payload: dict[str, Any]) -> None:
+        """Who comes and goes."""
+        person = payload.get("person")
+        if person and kind in ("invited", "joined", "revoked"):
+            self.gone = self.gone | {person} if kind == "revoked" else self.gone - {person}
 
 
 @dataclass(eq=False)
@@ -98,6 +111,7 @@ class _Batch:
     after: list[Callable[[sa.Connection], None]] = field(default_factory=list)
     folds: list[tuple[_Waiting, Record, truth.Fold]] = field(default_factory=list)
     answers: list[tuple[_Waiting, Said]] = field(default_factory=list)
+    early: bool = False  #: told before the disk has it
 
 
 class Hub:
@@ -112,6 +126,10 @@ class Hub:
         self._queue: asyncio.Queue[_Waiting] = asyncio.Queue()
         self._books: dict[str, Book] = {}
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="log")
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="disk")
+        self._flushing: asyncio.Task[None] | None = None
+        self._unflushed = self._untidy = 0  #: words that the disk may not have, and all since it was last tidied up
+        self._cautious = False  #: the disk refused what was told: from then on every word waits for it
         self._task: asyncio.Task[None] | None = None
         self._ticks: asyncio.Task[None] | None = None
         self._numbers = 0
@@ -137,7 +155,10 @@ class Hub:
         if self._task is not None:
             await self._queue.join()
             self._task.cancel()
+        if self._flushing is not None:
+            await self._flushing
         self._writer.shutdown()
+        self._disk.shutdown()
 
     # ------------------------------------------------------------------------------------------------------- saying
 
@@ -248,6 +269,7 @@ class Hub:
         for r in journal.entries(self.engine, case):
             if not r.refused:
                 book.truth = truth.follow(book.truth, r, self._settings).truth
+                book.admit(r.kind, r.payload or {})
             book.seq, book.head = r.seq, r.hash
             if r.actor != INSTRUMENT:  # it never says anything twice
                 book.said.setdefault((r.actor, r.client), Heard()).keep(r.number, r.seq, r.refused)
@@ -273,7 +295,7 @@ class Hub:
                     self._queue.task_done()
 
     async def _take(self, waiting: list[_Waiting], again: bool = True) -> None:
-        batch = _Batch()
+        batch = _Batch(early=not self._cautious and all(w.kind in _EARLY for w in waiting))
         try:
             for w in waiting:
                 if w.case not in batch.books:
@@ -299,11 +321,16 @@ class Hub:
             self._refuse(waiting, f"{why}; nothing was changed")
             return
         self._keep(batch)
+        self._untidy += len(batch.records)
+        if batch.early or self._untidy >= _TIDY:
+            self._flush_soon(len(batch.records))
         for w, said in batch.answers:
             if not w.answer.done():
                 w.answer.set_result(said)
         for w, record, fold in batch.folds:
             self.rooms.event(w.case, as_event(record))
+            if record.kind == "revoked" and not record.refused and w.payload.get("person"):
+                self.rooms.expel(w.payload["person"], w.case)
             try:
                 await self._follow_up(w.case, record, fold)
             except Exception:  # the next ones are told all the same
@@ -362,6 +389,8 @@ class Hub:
             batch.answers.append((w, said))
             return
         book = batch.books[w.case]
+        if w.actor in book.gone and w.role in _INVITED and not w.refused:  # it waited behind the word that ended that
+            w.refused, w.payload = EXPELLED[1], {}
         bare = Record(
             w.case, book.seq + 1, self.clock.now_ns(), w.said_ns, w.actor, w.role, w.client, w.number, w.kind,
             w.refused, secrets.token_hex(16), w.payload, "", "",
@@ -371,6 +400,8 @@ class Hub:
             fold = truth.follow(book.truth, bare, self._settings)
         record = link(replace(bare, payload=fold.payload, refused=fold.refused), book.head)
         book.truth, book.seq, book.head = fold.truth, record.seq, record.hash
+        if not record.refused:
+            book.admit(record.kind, record.payload or {})
         if w.client != self._run:
             batch.said[w.case, w.actor, w.client, w.number] = (record.seq, record.refused)
         batch.records.append(record)
@@ -383,12 +414,33 @@ class Hub:
         batch.answers.append((w, said))
 
     def _commit(self, batch: _Batch) -> None:
-        with db.writing(self.engine) as c:
+        with db.writing(self.engine, batch.early) as c:
             for beside in batch.beside:
                 beside(c)
             journal.append(c, batch.records)
             for after in batch.after:
                 after(c)
+
+    def _flush_soon(self, words: int) -> None:
+        """Brings what was told to the disk, all that there is at once."""
+        self._unflushed += words
+        if self._flushing is None or self._flushing.done():
+            self._flushing = asyncio.create_task(self._flush(), name="disk")
+
+    async def _flush(self) -> None:
+        while self._unflushed:
+            self._unflushed = 0
+            tidy, self._untidy = self._untidy >= _TIDY, self._untidy % _TIDY
+            try:
+                await asyncio.get_running_loop().run_in_executor(self._disk, self._to_disk, tidy)
+            except (OutputError, sa.exc.SQLAlchemyError) as e:
+                self._cautious = True
+                _LOG.error("what was told may not be on the disk: %s; from now on every word waits for it", e)
+
+    def _to_disk(self, tidy: bool) -> None:
+        db.flush(self.engine)
+        if tidy:
+            db.tidy(self.engine)
 
     async def _follow_up(self, case: str, record: Record, fold: truth.Fold) -> None:
         if fold.refused:

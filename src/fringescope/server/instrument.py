@@ -70,6 +70,7 @@ class Instrument:
         self._open = False
         self._cameras: tuple[str, ...] = ()
         self.watching: Counter[str] = Counter()  #: streams of video, by who watches
+        self.peers = 0  #: of these by WebRTC
         self._frames: dict[tuple[str, int, int], asyncio.Task[Any]] = {}  #: that are being taken for who watches
         self._filming = asyncio.Lock()
         self._hand = asyncio.Lock()  #: one thing at a time is done with the devices
@@ -387,9 +388,12 @@ class Instrument:
         finally:
             del self._frames[camera, width, quality]
 
-    async def shown(self) -> bool:
-        """Whether the projector itself says that it holds a picture. Raises DeviceError."""
-        return bool(await self._devices.call("shown"))
+    async def shown(self) -> int:
+        """Since when (`time.monotonic_ns`) the projector itself says that it holds a picture; 0 = it is dark.
+
+        Raises DeviceError.
+        """
+        return int(await self._devices.call("shown"))
 
     async def befall(self, what: dict[str, str]) -> None:
         """For the simulated instrument: something happens to the specimen. Raises UsageError for what cannot."""

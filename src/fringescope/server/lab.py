@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
 
-from fringescope.errors import FringescopeError, UsageError
+from fringescope.errors import DeviceLostError, FringescopeError, UsageError
 from fringescope.server import cases
 from fringescope.server.accounts import new_id
 from fringescope.server.blobs import Blobs
@@ -24,15 +25,19 @@ from fringescope.store import parse_board, write_json
 from fringescope.types.examination import DeviceBack, RigChanged, ScanTaken
 from fringescope.wire import ScanFile, ScanInfo
 
+_PACKED_S = 30.0  #: a scan waits no longer for the levels that are sent: the plain files serve as well
+_LOG = logging.getLogger("fringescope.lab")
+
 
 class Lab:
     """What is done with the instrument and in the workshop, for one case after the other."""
 
     def __init__(
-        self, hub: Hub, blobs: Blobs, shelf: Shelf, instrument: Instrument, workshop: Child, config: Config
-    ) -> None:
+        self, hub: Hub, blobs: Blobs, shelf: Shelf, instrument: Instrument, workshop: Child, packer: Child,
+        config: Config,
+    ) -> None:  # fmt: skip
         self._hub, self._blobs, self._shelf = hub, blobs, shelf
-        self._instrument, self._workshop = instrument, workshop
+        self._instrument, self._workshop, self._packer = instrument, workshop, packer
         self._settings = to_dict(config.settings)
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -49,9 +54,28 @@ class Lab:
                 "reconstruct", lambda stage, share: tell(stage, 0.4 + 0.5 * share), capture=str(folder / "capture"),
                 rig=rig, out=str(folder / "scan"), settings=self._settings,
             )  # fmt: skip
-            await self._computed("photographs", tell, scan=str(folder / "scan"))
+            packed = asyncio.create_task(self._pack(folder / "scan", folder / "packed"))
+            try:
+                await self._computed("photographs", tell, scan=str(folder / "scan"))
+                await packed
+            finally:
+                packed.cancel()
             tell("keeping", 0.9)
             return await self.keep(case, label, folder / "scan", doc)
+
+    async def _pack(self, scan: Path, out: Path) -> None:
+        """The levels of a scan's surface that are sent, into its folder; without them the plain files have to do."""
+        try:
+            async with asyncio.timeout(_PACKED_S):
+                try:
+                    names = await self._packer.call("levels", scan=str(scan), out=str(out))
+                except DeviceLostError:  # somebody ended it for another reason
+                    names = await self._packer.call("levels", scan=str(scan), out=str(out))
+        except (TimeoutError, FringescopeError) as e:
+            _LOG.warning("the surface was not packed for the wire: %s", e or "the packer was busy")
+            return
+        for name in names:
+            (out / name).replace(scan / name)
 
     async def _computed(self, what: str, tell: Tell, **how: Any) -> Any:
         """Has the workshop compute something; who cancels that ends it at once, and all else begins anew."""

@@ -54,11 +54,11 @@ class Leaving:
 
     def __init__(
         self, config: Config, hub: Hub, blobs: Blobs, accounts: Accounts, jobs: Jobs, instrument: Instrument,
-        lab: Lab, checkpoints: Checkpoints,
+        lab: Lab, checkpoints: Checkpoints, packer: Child,
     ):  # fmt: skip
         self._config, self._hub, self._blobs, self._accounts = config, hub, blobs, accounts
         self._jobs, self._instrument, self._lab, self._key = jobs, instrument, lab, checkpoints.key
-        self._packer = Child("fringescope.server.processes.packer")
+        self._packer = packer
         self._turn = asyncio.Lock()
         self.taking: Counter[str] = Counter()  #: bundles on their way out, by who takes them
 

@@ -113,7 +113,8 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
         accounts.gone = rooms.expel
         shelf, workshop = Shelf(config.data, engine, blobs, config.rig), Child("fringescope.server.processes.workshop")
         instrument = Instrument(hub, blobs, shelf, workshop, config)
-        lab = Lab(hub, blobs, shelf, instrument, workshop, config)
+        packer = Child("fringescope.server.processes.packer")
+        lab = Lab(hub, blobs, shelf, instrument, workshop, packer, config)
         site = Site(
             config, engine, clock, blobs, accounts, Invitations(engine, clock, accounts), rooms, hub, jobs,
             instrument, lab, Throttle(limits.requests_per_s, limits.requests_burst),
@@ -121,7 +122,7 @@ def open_site(config: Config, hasher: argon2.PasswordHasher | None = None) -> Si
             Throttle(limits.ops_per_s, limits.ops_burst),
             Throttle(limits.log_bytes_per_s, limits.log_bytes_burst), Passkeys(engine, clock, accounts),
             None if config.provider is None else OpenId(config.provider, config.origin, clock, accounts), checkpoints,
-            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints), lock, held,
+            Leaving(config, hub, blobs, accounts, jobs, instrument, lab, checkpoints, packer), lock, held,
         )  # fmt: skip
         undo.pop_all()
     return site

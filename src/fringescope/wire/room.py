@@ -65,7 +65,10 @@ FromClient = Annotated[Say | Pointer | View | Ink | Ping, Field(discriminator="t
 
 
 class Welcome(_Message):
-    """The first message: who you are here, how far the log goes, who is in the room."""
+    """The first message: who you are here, how far the log goes, who is in the room.
+
+    `anew`: what you have is not in the log any more, as after a power cut; forget it, all events come again.
+    """
 
     type: Literal["welcome"] = "welcome"
     person: Word
@@ -73,6 +76,7 @@ class Welcome(_Message):
     local: bool
     seq: int
     present: list[str]
+    anew: bool = False
 
 
 class Event(_Message):

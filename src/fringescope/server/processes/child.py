@@ -1,7 +1,8 @@
 """The child's side: `python -m fringescope.server.processes.child MODULE` answers calls, a line of JSON each.
 
-MODULE has a class Hand: its `calls` are carried out one by one, its `urgent` ones at once, whatever is being done.
-What goes wrong comes back as a line. When the pipe closes, the child ends.
+MODULE has a class Hand: its `calls` are carried out one by one, its `urgent` ones at once, whatever is being done, and
+those `aside`, if it has any, one by one beside the others: nothing waits for them. What goes wrong comes back as a
+line. When the pipe closes, the child ends.
 """
 
 from __future__ import annotations
@@ -80,6 +81,12 @@ def main(name: str) -> None:
     module: Any = importlib.import_module(name)
     hand = module.Hand(lambda event: write(out, {"event": event}))
     waiting: queue.Queue[dict[str, Any] | None] = queue.Queue()
+    beside: queue.Queue[dict[str, Any]] = queue.Queue()
+    aside: dict[str, Callable[..., Any]] = getattr(hand, "aside", {})
+
+    def carry_out_aside() -> None:
+        while True:
+            carry_out(beside.get(), aside, out)
 
     def read() -> None:
         for line in sys.stdin.buffer:
@@ -88,6 +95,8 @@ def main(name: str) -> None:
                 _CANCELLED.add(message["cancel"])
             elif message["call"] in hand.urgent:
                 carry_out(message, hand.urgent, out)
+            elif message["call"] in aside:
+                beside.put(message)
             else:
                 waiting.put(message)
         hand.ended()
@@ -95,6 +104,8 @@ def main(name: str) -> None:
         os._exit(0)  # also out of the middle of a computation: nobody waits for it
 
     threading.Thread(target=read, name="calls", daemon=True).start()
+    if aside:
+        threading.Thread(target=carry_out_aside, name="aside", daemon=True).start()
     write(out, {"ready": True})
     while (message := waiting.get()) is not None:
         carry_out(message, hand.calls, out)

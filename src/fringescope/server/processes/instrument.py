@@ -159,10 +159,11 @@ class Hand:
         self._dark_from = 0  #: calls with a lower number were made before somebody said dark: they light nothing
         self.calls: dict[str, Callable[..., Any]] = {
             "open": self.open_, "close": self.close, "capture": self.capture, "ready": self.ready, "rest": self.rest,
-            "look": self.look, "live": self.live, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
+            "look": self.look, "show": self.show, "befall": self.befall, "twin_rig": self.twin_rig,
             "selftest": self.selftest, "shown": self.shown,
         }  # fmt: skip
         self.urgent: dict[str, Callable[..., Any]] = {"dark": self.dark, "beat": self.beat}
+        self.aside: dict[str, Callable[..., Any]] = {"live": self.live}  # who turns on the light waits for no video
 
     def _opened(self) -> Station:
         if self._station is None:
@@ -219,7 +220,8 @@ class Hand:
         photos: tuple[Any, ...] = (None,) * len(cameras)
         if station.light is not None:
             wanted = [v.pixel_format for v in plan.views]
-            photos = capturing.photograph(station.projector, cameras, station.light, wanted, s.capture)
+            with self._cameras:
+                photos = capturing.photograph(station.projector, cameras, station.light, wanted, s.capture)
 
         def counted(frames: Any, camera: str) -> Iterator[Any]:
             nonlocal done
@@ -236,7 +238,7 @@ class Hand:
                 yield ViewInput(view, counted(frames, view.camera), photo)
 
         try:
-            with store.new_folder(Path(out), marker="capture.json") as tmp:
+            with self._cameras, store.new_folder(Path(out), marker="capture.json") as tmp:
                 store.put_capture(tmp, i.width, i.height, i.layout, views(), {"instrument": self._uri})
         finally:
             station.projector.dark()
@@ -290,15 +292,16 @@ class Hand:
         if call.number < self._dark_from:  # while it was being turned on
             self._ready.dark()
             self._not_dark(call)
-        return {"shown_ns": time.time_ns()}
+        return {"shown_ns": time.time_ns() - max(0, time.monotonic_ns() - (self.shown(call) or time.monotonic_ns()))}
 
     def _not_dark(self, call: Call) -> None:
         if call.number < self._dark_from:
             raise RejectedError(STOPPED)
 
-    def shown(self, _call: Call) -> bool:
-        """Whether the projector itself says that it holds a picture."""
-        return self._opened().projector.shown is not None
+    def shown(self, _call: Call) -> int:
+        """Since when (`time.monotonic_ns`) the projector itself says that it holds a picture; 0 = it is dark."""
+        held = self._opened().projector.held
+        return 0 if held is None else held.at_ns
 
     def rest(self, _call: Call) -> None:
         """Dark, no watchdog, nobody looks: the devices are free."""
@@ -319,7 +322,8 @@ class Hand:
         call.progress("self-test", 0.0)
         station = self._opened()
         try:
-            found = self_test(station, store.read_rig(Path(rig)), s)
+            with self._cameras:
+                found = self_test(station, store.read_rig(Path(rig)), s)
         finally:
             station.projector.dark()
         figures = {"median_um": found.median_um, "p95_um": found.p95_um, "max_um": found.max_um}

@@ -1,4 +1,4 @@
-"""What is made when a case leaves or comes in: STL, the report, and a look at scans that somebody hands in."""
+"""What is made for those elsewhere: surfaces packed for the wire, STL, the report, a look at scans that come in."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from fringescope.settings import Settings
 from fringescope.types import U8
 
 _GRID = 200_000  #: places of a view among which that of a stroke is looked for
+_LEVELS = (20_000, 200_000)  #: triangles of the levels that are sent, coarse to fine; the surface itself is the last
+_FIRST_BYTES = 700_000  #: of the first of them, pictures and all
 _FAR_MM = 2.0  #: a place farther from all of them was not seen by that camera
 
 
@@ -102,6 +104,8 @@ def examine(call: Call, folder: str) -> dict[str, Any]:
     if any(p is not None for p in stored.pictures):
         call.progress("photographs", 0.6)
         photographs(call, stored)
+    call.progress("levels", 0.9)
+    levels(call, folder, folder)
     plain: dict[str, Any] = store.plain(doc)
     return plain
 
@@ -118,11 +122,35 @@ def photographs(call: Call, stored: store.StoredScan) -> None:
             (stored.folder / f"photo-{picture.camera}.jpg").write_bytes(data)
 
 
+def levels(call: Call, scan: str, out: str) -> list[str]:
+    """The surface of a scan's folder as packed GLBs for the wire, coarse to fine, in folder `out`; their names.
+
+    None where there is no surface, or nothing that packs.
+    """
+    stored = store.read_scan(scan, grids=False, check=False)
+    if stored.surface is None or not export.can_pack():
+        return []
+    surface = export.read_glb(stored.surface)
+    told = {"scan": str(stored.document.get("hash")), "of_triangles": surface.n_faces}
+    Path(out).mkdir(parents=True, exist_ok=True)
+    first = export.coarse_bytes(surface, _LEVELS[0], _FIRST_BYTES, {**told, "level": 0})
+    call.check()
+    second = export.packed_bytes(
+        export.thinned(surface, _LEVELS[1]), export.read_pictures(stored.surface), {**told, "level": 1}
+    )
+    call.check()
+    made = []
+    for k, data in enumerate((first, second)):
+        made.append(f"level-{k}.glb")
+        (Path(out) / made[-1]).write_bytes(data)
+    return made
+
+
 class Hand:
     """The packer's calls."""
 
     def __init__(self, _emit: Callable[[dict[str, Any]], None]) -> None:
-        self.calls: dict[str, Callable[..., Any]] = {"leave": leave, "examine": examine}
+        self.calls: dict[str, Callable[..., Any]] = {"leave": leave, "examine": examine, "levels": levels}
         self.urgent: dict[str, Callable[..., Any]] = {}
 
     def ended(self) -> None:

@@ -1,21 +1,18 @@
-"""The room of a case: one WebSocket for all that happens, and one for live video."""
+"""The room of a case: one WebSocket for all that happens."""
 
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
-import json
 import logging
 import re
-import time
 from typing import Any
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 
-from fringescope.errors import DeviceError, FringescopeError
+from fringescope.errors import FringescopeError
 from fringescope.server import database as db
 from fringescope.server import journal, truth
 from fringescope.server.accounts import SignInError
@@ -35,27 +32,27 @@ _LOG = logging.getLogger("fringescope.room")
 _PARTING_S = 30.0  #: so long a browser may take until it reads why it was let go
 
 
-async def _enter(socket: WebSocket, case: str, what: str) -> Asking | None:
+async def enter(socket: WebSocket, case: str, what: str) -> Asking | None:
     """Who comes in, or None after the door was closed with a reason."""
     site = socket.app.state.site
     case = case if _CASE.fullmatch(case) else "none"
     if not origin_fits(socket.scope, site.config):
-        await _close(socket, 4403, "this connection comes from another site's page; open the hub's own page")
+        await turn_away(socket, 4403, "this connection comes from another site's page; open the hub's own page")
         return None
     try:
         asking = await run_in_threadpool(asking_of, socket)
     except SignInError as e:
-        await _close(socket, 4401, str(e))
+        await turn_away(socket, 4401, str(e))
         return None
     seen = await run_in_threadpool(may_see, site, asking.speaker, case)
     why = refusal(asking.speaker, what) or ("" if seen else "there is no such case, or you were not invited to it")
     if why:
-        await _close(socket, 4404 if not seen else 4403, why)
+        await turn_away(socket, 4404 if not seen else 4403, why)
         return None
     return asking
 
 
-async def _close(socket: WebSocket, code: int, why: str) -> None:
+async def turn_away(socket: WebSocket, code: int, why: str) -> None:
     """Accepted first: a browser hears the reason only then."""
     with contextlib.suppress(RuntimeError, WebSocketDisconnect):
         await socket.accept()
@@ -63,15 +60,18 @@ async def _close(socket: WebSocket, code: int, why: str) -> None:
 
 
 @router.websocket("/api/cases/{case}/room")
-async def room(socket: WebSocket, case: str, since: int = 0) -> None:
-    """All events behind number `since`, then all that come; ops, pointers and ink the other way."""
-    asking = await _enter(socket, case, "case.read")
+async def room(socket: WebSocket, case: str, since: int = 0, hash: str = "") -> None:
+    """All events behind number `since`, then all that come; ops, pointers and ink the other way.
+
+    `hash`: that of event `since`, as you had it; if the log has another there, all comes anew.
+    """
+    asking = await enter(socket, case, "case.read")
     if asking is None:
         return
     site = asking.site
     most, person = site.config.limits.present, asking.speaker.person
     if site.rooms.count(case) >= most or site.rooms.count(case, person) >= max(1, most // 2):
-        await _close(socket, 1013, "this room is full; try again later")
+        await turn_away(socket, 1013, "this room is full; try again later")
         return
     await socket.accept()
     listener = site.rooms.join(case, asking.speaker, asking.session.digest)  # from here on nothing is missed
@@ -80,7 +80,7 @@ async def room(socket: WebSocket, case: str, since: int = 0) -> None:
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(*EXPELLED)
         return
-    sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since)))
+    sender = asyncio.create_task(_send(socket, asking, case, listener, max(0, since), hash))
     receiver = asyncio.create_task(_receive(socket, asking, case, listener))
     listener.on_end = lambda: _end(sender)  # it may hang on a browser that does not read
     try:
@@ -101,12 +101,21 @@ def _end(task: asyncio.Task[None]) -> None:
     task.cancel()
 
 
-async def _send(socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int) -> None:
+async def _send(
+    socket: WebSocket, asking: Asking, case: str, listener: Listener, since: int, known: str
+) -> None:  # fmt: skip
     site, who = asking.site, asking.speaker
     now, seq = await site.hub.truth_of(case)
-    since = min(since, seq)
+
+    def other() -> bool:
+        with db.reading(site.engine) as c:
+            found = journal.read(c, case, since - 1, 1)
+        return not found or found[0].hash != known
+
+    anew = since > seq or bool(since and known and await run_in_threadpool(other))
+    since = 0 if anew else since
     here = site.rooms.present(case)
-    hello = Welcome(person=who.person, role=who.role.value, local=who.local, seq=seq, present=here)
+    hello = Welcome(person=who.person, role=who.role.value, local=who.local, seq=seq, present=here, anew=anew)
     await socket.send_text(hello.model_dump_json())
 
     def page(after: int) -> list[str]:
@@ -149,15 +158,15 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
                 listener.end(EXPELLED)
                 return
             if text is None:
-                listener.send(_refused("a message of bytes; needed one JSON object as text"))
+                listener.send(refused("a message of bytes; needed one JSON object as text"))
                 continue
             if len(text) > limits.message_bytes:
-                listener.send(_refused(f"a message of {len(text)} letters; at most {limits.message_bytes} are taken"))
+                listener.send(refused(f"a message of {len(text)} letters; at most {limits.message_bytes} are taken"))
                 continue
             try:
                 said = _MESSAGE.validate_json(text)
             except ValidationError as e:
-                listener.send(_refused(_why(e)))
+                listener.send(refused(_why(e)))
                 continue
             listener.active = listener.active or not isinstance(said, Ping)
             if isinstance(said, Ping):
@@ -166,7 +175,7 @@ async def _receive(socket: WebSocket, asking: Asking, case: str, listener: Liste
                 await _say(asking, case, listener, said, waiting, len(text))
             elif (why := refusal(asking.speaker, said.type)) or not live.take():
                 if why:
-                    listener.send(_refused(why))
+                    listener.send(refused(why))
             else:
                 site.rooms.relay(case, listener, Relayed(person=asking.speaker.person, what=said))
     finally:
@@ -222,7 +231,8 @@ def _renewed(asking: Asking) -> Asking:
     return replace(asking, speaker=replace(asking.speaker, confirmed_ns=at))
 
 
-def _refused(why: str) -> str:
+def refused(why: str) -> str:
+    """A message for who said something, or asked for something, of which nothing comes."""
     return Refusal(why=why).model_dump_json()
 
 
@@ -230,70 +240,3 @@ def _why(e: ValidationError) -> str:
     first = e.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(x) for x in first["loc"])
     return one_line(f"a message that nobody understands: {where + ': ' if where else ''}{first['msg']}")
-
-
-# -------------------------------------------------------------------------------------------------------------- video
-
-_LATE_ACKS = 100  #: other words than the acknowledgement that are passed over
-QUALITIES = ((640, 50), (960, 60), (1280, 70), (1920, 80))  #: widths and JPEG qualities, from a poor line to a good one
-
-
-@router.websocket("/api/cases/{case}/video/{camera}")
-async def video(socket: WebSocket, case: str, camera: str) -> None:
-    """What a camera sees: a line of JSON about a frame, the frame as JPEG, and the next once that was acknowledged.
-
-    Each frame carries the scan that the case stands at, and its time. Width and quality follow from how long it takes
-    until a frame is acknowledged.
-    """
-    asking = await _enter(socket, case, "video")
-    if asking is None:
-        return
-    site = asking.site
-    limits, watching, person = site.config.limits, site.instrument.watching, asking.speaker.person
-    if watching.total() >= limits.videos or watching[person] >= limits.videos_each:
-        each = watching[person] >= limits.videos_each
-        why = f"you watch {watching[person]} streams already; close one" if each else "too many watch already"
-        await _close(socket, 1013, f"{why}; try again later")
-        return
-    watching[person] += 1
-    try:
-        await socket.accept()
-        await _film(socket, asking, case, camera)
-    finally:
-        watching[person] -= 1
-
-
-async def _film(socket: WebSocket, asking: Asking, case: str, camera: str) -> None:
-    """One frame after the other, as long as they are acknowledged and the person may see them."""
-    site = asking.site
-    level, number = 1, 0
-    try:
-        while await run_in_threadpool(still, asking, case):
-            width, quality = QUALITIES[level]
-            try:
-                frame = await site.instrument.live(camera, width, quality)
-            except DeviceError as e:
-                await socket.send_text(_refused(str(e)))
-                await asyncio.sleep(1.0)
-                continue
-            now, _ = await site.hub.truth_of(case)
-            data = base64.b64decode(frame["jpeg"])
-            number += 1
-            told = {"type": "frame", "number": number, "camera": camera, "at_ns": frame["at_ns"],
-                    "scan": now.exam.scan, "bytes": len(data), "width": width, "quality": quality}  # fmt: skip
-            begun = time.monotonic()
-            await socket.send_text(json.dumps(told))
-            await socket.send_bytes(data)
-            async with asyncio.timeout(30):
-                for _ in range(_LATE_ACKS):
-                    answer = json.loads(await socket.receive_text())
-                    if isinstance(answer, dict) and answer.get("ack") == number:
-                        break
-                else:
-                    raise ValueError("nothing but other words")
-            took = 1000 * (time.monotonic() - begun)
-            level = max(0, level - 1) if took > 250 else min(len(QUALITIES) - 1, level + 1) if took < 60 else level
-        await socket.close(*EXPELLED)
-    except (WebSocketDisconnect, TimeoutError, ValueError, KeyError, RuntimeError):  # KeyError: bytes, no text
-        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-            await socket.close(1000)
