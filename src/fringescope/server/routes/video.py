@@ -27,7 +27,7 @@ def _full(site: Site, person: str) -> str:
     """Why somebody may not watch one camera more, in a sentence; "" where they may."""
     limits, watching = site.config.limits, site.instrument.watching
     if watching[person] >= limits.videos_each:
-        return f"you watch {watching[person]} streams already; close one, try again later"
+        return f"you watch {watching[person]} streams already; close one; try again later"
     return "too many watch already; try again later" if watching.total() >= limits.videos else ""
 
 
