@@ -31,13 +31,17 @@ def open_socket(case: HubCase) -> Any:
     return connect(url, additional_headers={"Cookie": cookies}, compression=None, max_size=None)
 
 
+def no_number(name: str) -> None:
+    raise AssertionError(f"{name} is no number that a browser reads")
+
+
 def until(socket: ClientConnection, *types: str) -> dict[str, Any]:
     """The next message of one of these types. All must be as they are described."""
     while True:
         text = socket.recv(timeout=10)
         assert isinstance(text, str)
         FROM_SERVER.validate_json(text)
-        assert "NaN" not in text
+        json.loads(text, parse_constant=no_number)
         m: dict[str, Any] = json.loads(text)
         if m["type"] in types:
             return m
